@@ -17,6 +17,17 @@ from neural_sim.configuration import UserError, first_line
 OWN_WORDS = ("--config-name", "-cn", "--config-path", "-cp", "--shell-completion", "-sc", "--hydra-help")
 """Flags with which the configuration is another, or the words are no settings: nothing is checked here."""
 FOLDERS = ("--config-dir", "-cd")
+PATHS = {
+    "objects.root": "a folder that holds a folder for each object",
+    "target.root": "the data set's folder",
+    "target.annotations": "a COCO file of labelled photographs",
+    "synthesis.background.root": "a folder of photographs",
+    "synthesis.distractors.root": "a folder of cut-outs",
+    "predict.model": "a run's folder, such as outputs/runs/pose_gap/<time>",
+    "predict.images": "a picture, a folder or a pattern in quotes",
+    "predict.annotations": "a COCO file",
+}
+"""Keys of what a user brings, and what it must be."""
 WITH_VALUE = (*FOLDERS, "--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun")
 
 
@@ -84,6 +95,12 @@ class Layout:
         return found
 
     @cached_property
+    def tasks(self) -> tuple[str, ...]:
+        """The nodes of ``config.yaml`` that ``stages`` may name, beside a run's phases."""
+        text = (self.folders[0] / "config.yaml").read_text(encoding="utf-8")
+        return tuple(re.findall(r"^(\w+):.*\n  _target_: neural_sim\.tasks\.", text, re.MULTILINE))
+
+    @cached_property
     def top(self) -> set[str]:
         """The first parts of all keys and groups."""
         return {key.partition(".")[0] for key in self.keys} | {
@@ -100,10 +117,15 @@ def layout_of(words: Sequence[str], conf: Path) -> Layout | None:
     return Layout((conf, *(Path(folder) for folder in more if Path(folder).is_dir())))
 
 
-def checked(words: Sequence[str], layout: Layout) -> None:
+def checked(words: Sequence[str], layout: Layout, commands: Iterable[str] = ()) -> None:
     """Refuse what cannot be meant, before anything is composed.
 
     Hydra proposes ``+detecter=fcos`` for ``detecter=fcos``, and then runs the default detector.
+
+    Args:
+        words: of the command line.
+        layout: the files that it is checked against.
+        commands: that could stand at its beginning.
 
     Raises:
         UserError: a word that is no setting, an unknown group, choice or key of the top level.
@@ -116,10 +138,12 @@ def checked(words: Sequence[str], layout: Layout) -> None:
         name = word.lstrip("+~")
         key, equals, value = name.partition("=")
         if not equals and not word.startswith("~"):
-            raise UserError(_no_setting(word, layout))
+            raise UserError(_no_setting(word, layout, commands))
         if key.startswith("hydra") or "@" in key:
             continue
-        if key in layout.groups:
+        if key == "stages":
+            _check_stages(word, value, layout, words)
+        elif key in layout.groups:
             _check_choice(word, key, value, layout)
         elif "/" in key:
             raise UserError(f"{key}: no such group{_meant(key, layout.groups)}")
@@ -127,16 +151,46 @@ def checked(words: Sequence[str], layout: Layout) -> None:
             raise UserError(explained(key.partition(".")[0], layout))
 
 
+def present(words: Sequence[str]) -> None:
+    """Refuse paths that lead nowhere, before anything heavy is imported; patterns and sweeps are left alone.
+
+    Raises:
+        UserError: with what is wanted in the place of a path.
+    """
+    for word in words:
+        key, _, value = word.lstrip("+").partition("=")
+        path = value.strip("\"'")
+        plain = key in PATHS and path != "null" and not set(path) & set("*?[{$,")
+        if plain and not Path(path).expanduser().exists():
+            raise UserError(f"{key}: {path} does not exist; want {PATHS[key]}")
+
+
+def _check_stages(word: str, value: str, layout: Layout, words: Sequence[str]) -> None:
+    phases = re.findall(r"\w+", layout.keys["stages"][0].value)
+    own = {other.lstrip("+").partition("=")[0].partition(".")[0] for other in words}
+    for stage in re.findall(r"[\w-]+", value) if "$" not in value else ():
+        if stage not in phases and stage not in layout.top | own:
+            known = [*phases, *layout.tasks]
+            raise UserError(
+                f"{word}: no stage {stage}{_meant(stage, known)}; want some of {', '.join(known)}"
+            )
+
+
 def _declared(word: str, key: str, value: str) -> bool:
     """Return whether a word adds something of the user's own, such as a task."""
     return word.startswith("+") and (key.endswith("._target_") or "_target_" in value)
 
 
-def _no_setting(word: str, layout: Layout) -> str:
+def _no_setting(word: str, layout: Layout, commands: Iterable[str]) -> str:
     if word in layout.groups.get("experiment", ()):
         return f"{word}: want +experiment={word}"
     if word in layout.groups:
         return f"{word}: want {word}= and one of {', '.join(layout.groups[word])}"
+    if re.fullmatch(r"[\d.]+", word):
+        return f"{word}: want key=value; values of a sweep are joined by commas, such as -m seed=0,1,2"
+    meant = _meant(word, {*commands, *layout.groups.get("experiment", ())})
+    if meant and " " not in word:
+        return f"{word}: no such command or experiment{meant}"
     return f"{word}: want key=value, such as seed=1 (in quotes, where it has spaces), or --help"
 
 

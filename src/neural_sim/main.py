@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shlex
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from typing_extensions import override
 
-from neural_sim.commandline import checked, layout_of, worded
+from neural_sim.commandline import PATHS, checked, layout_of, present, worded
 from neural_sim.configuration import (
     UserError,
     conf_directory,
@@ -36,7 +37,7 @@ from neural_sim.configuration import (
     updated,
     view_size,
 )
-from neural_sim.guide import answer, spoken
+from neural_sim.guide import VERBS, answer, spoken
 from neural_sim.interruption import interruptible
 from neural_sim.ranges import NonNegativeInt, PositiveFraction, PositiveInt, check
 
@@ -219,9 +220,10 @@ def _plain(config: DictConfig) -> dict[str, Any]:
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        wanted = (config.get("needs") or {}).get(str(error.full_key))
-        if wanted is not None and isinstance(error, MissingMandatoryValue):
-            raise UserError(f"{error.full_key} is not given: want {wanted}") from error
+        if isinstance(error, MissingMandatoryValue):
+            key = str(error.full_key)
+            wanted = (config.get("needs") or {}).get(key) or f"{PATHS.get(key, 'a value')}, {key}=..."
+            raise UserError(f"{key} is not given: want {wanted}") from error
         raise UserError(f"{error.full_key or 'configuration'}: {first_line(error)}") from error
     if not isinstance(plain, dict):
         raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
@@ -251,6 +253,8 @@ def _told(message: str, node: Mapping[str, Any], where: str, inner: str) -> str:
     for key in filter(None, inner.split(".")):
         made, where = made.get(key) if isinstance(made, Mapping) else None, f"{where}.{key}"
     made = made["_target_"].rpartition(".")[2] if isinstance(made, Mapping) else ""
+    if message.startswith((f"{where}.", f"{where}:")):
+        return message
     rest = message.removeprefix(f"{made}.")
     return f"{where}: {message}" if rest == message else f"{where}.{rest}"
 
@@ -271,6 +275,8 @@ def _task(config: DictConfig) -> float | None:
         given = list(runtime.overrides.task)
         folder, name = Path(runtime.runtime.output_dir), runtime.job.config_name
         context, tasks = context_of(config, folder, lambda more: hydra.compose(name, _with(given, more)))
+        context.command = shlex.join(["python", "-m", "src.main", *given])
+        context.scale = str(runtime.runtime.choices.get("scale", ""))
         from neural_sim.tasks.walk import walk
 
         return walk(context, tasks)
@@ -336,6 +342,18 @@ class OwnFolder(Callback):
         return True
 
 
+class SweepTable(Callback):
+    """Ends a sweep with a table of its runs."""
+
+    @override
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        from neural_sim.report.sweep import sweep_table
+
+        folder = Path(config.hydra.sweep.dir)
+        if folder.is_dir() and (table := sweep_table(folder)):
+            print(table)
+
+
 def _refuse(error: Exception) -> NoReturn:
     """One line, and exit status 2."""
     _log.debug("details", exc_info=True)
@@ -359,7 +377,8 @@ def main() -> None:
             for note in notes:
                 print(f"neural-sim: {note}", file=sys.stderr)
             if layout is not None:
-                checked(sys.argv[1:], layout)
+                checked(sys.argv[1:], layout, VERBS)
+                present(sys.argv[1:])
             os.environ.setdefault(
                 "HYDRA_FULL_ERROR", "1"
             )  # errors come here instead of to stderr in many lines

@@ -95,7 +95,7 @@ def test_nothing_is_said_of_a_target_that_nobody_knows(results, tmp_path):
         "learned",
     }
     text = photographs.summary()
-    assert "learned" in text and "target" not in text and "matched" not in text
+    assert "after" in text and "target" not in text
     images = LabelledImages(
         torch.rand(1, 3, 16, 16), torch.zeros(1, 1, 4), torch.tensor([[-1]]), torch.zeros(1).long()
     )
@@ -117,8 +117,17 @@ def test_summary_names_every_method_and_object(results):
         "taken back at the end b (keeps 1 of 3 steps); "
     )
     trust += "cosine with the response of training 0.90, 0.90"
-    images = ("validation images, learned: 25.0", "without a box: 6")
-    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", *images, trust):
+    images = ("validation images, after: 25.0", "without a box: 6")
+    for word in (
+        "before",
+        "after",
+        "if the target were known",
+        "distance to target",
+        "60.0",
+        "nan",
+        *images,
+        trust,
+    ):
         assert word in text
 
 
@@ -127,15 +136,13 @@ def test_a_classification_run_says_accuracy_where_others_say_ap(results, uri, tm
     point = {"iteration": 1, "images": 9, "seconds": 2.0, "ap": scores}
     found = dataclasses.replace(results, score="accuracy", ap={"learned": scores}, curve=[point])
     lines = found.summary().splitlines()
-    assert lines[0].startswith("accuracy on the test set") and lines[1].split() == [
-        "learned",
+    assert lines[0].startswith("accuracy on test images") and lines[1].split() == [
+        "after",
         "60.0",
         "nan",
         "50.0",
     ]
-    assert (
-        "accuracy on the validation images, learned: 25.0" in found.summary() and "AP" not in found.summary()
-    )
+    assert "accuracy on the validation images, after: 25.0" in found.summary() and "AP" not in found.summary()
     held = json.loads(write_results(found, tmp_path / "run").read_text())
     assert held["score"] == "accuracy" and held["ap"]["learned"]["accuracy"] == 0.5
     assert json.loads(write_results(results, tmp_path / "other").read_text())["score"] == "AP"
@@ -201,7 +208,7 @@ def test_the_strip_shows_each_object_before_and_after_with_its_score(results):
     ]  # the biased object first
     words = [text.get_text() for text in axes.texts]
     assert words[:3] == ["the target", "rendered at first", "rendered now"]
-    assert words[3].startswith("b: AP\n") and " before\n" in words[3] and " now" in words[3]
+    assert words[3].startswith("b: AP\n") and " before\n" in words[3] and " after" in words[3]
 
 
 def live(uri, results):

@@ -59,7 +59,7 @@ def test_a_data_set_needs_objects_and_a_psi_alone(made):
     assert {Image.open(made / image["file"]).size for image in manifest["images"]} == {(48, 36)}
     assert {path.name for path in made.iterdir()} == {
         "annotations.json", "bop", "dataset.yaml", "images", "labels", "manifest.json", "psi.csv", "psi.json",
-        "records.jsonl", "segment",
+        "records.jsonl", "samples.html", "segment",
     }  # fmt: skip
     kinds = {path.parent.name for path in (made.parents[1] / "store").rglob("*.pt")}
     assert kinds == {"views", "field"}

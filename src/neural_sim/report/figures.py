@@ -9,20 +9,24 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from torch import Tensor
 
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.parameter.distributions import merged
-from neural_sim.report.run import Learned, RunResults
+from neural_sim.report.run import CALLED, Learned, RunResults
 from neural_sim.types import LabelledImages
 
 matplotlib.use("Agg")
 
 INK, MUTED, GRID = "#22262b", "#6b727b", "#e4e7ea"
 # Okabe and Ito's palette (Color Universal Design, 2008), which readers with any colour vision tell apart.
+Thumbnails = Mapping[str, Mapping[str, UInt8[Tensor, "bins h w 3"]]]
+"""Pictures of an object from the middle of every bin, by object and factor."""
 METHOD_COLOURS = {
     "ns": "#b0b7bf", "learned": "#0072b2", "matched": "#009e73", "synthetic_only": "#56b4e9", "real_only": "#e69f00",
     "views_only": "#cc79a7",
@@ -138,7 +142,8 @@ def ap_figure(
     for i, (method, scores) in enumerate(ap.items()):
         values = [100 * scores["per_class"].get(n, float("nan")) for n in order] + [100 * mean_of(scores)]
         x = np.arange(len(labels)) + (i - (len(ap) - 1) / 2) * width
-        axes.bar(x, values, 0.92 * width, color=METHOD_COLOURS.get(method, MUTED), label=method)
+        axes.bar(x, values, 0.92 * width, color=METHOD_COLOURS.get(method, MUTED),
+                 label=CALLED.get(method, method))  # fmt: skip
         for at, value in zip(x, values, strict=True):
             if np.isfinite(value):
                 axes.text(at, value + 1, f"{value:.0f}", ha="center", fontsize=7, color=INK)
@@ -212,7 +217,7 @@ def strip_figure(
     """
     height, width = target.images.shape[-2:]
     head, gap, inch = round(0.2 * height), round(0.25 * width), width  # an image is an inch wide
-    chosen = [*results.biased, *(name for name in results.names if name not in results.biased)][:rows]
+    chosen = _first(results, rows)
     across = sum(STRIP.values()) * width + len(STRIP) * gap + 2 * inch  # two inches of words
     canvas = np.ones((head + len(chosen) * height, across, 3), dtype=np.float32)
     figure = Figure(figsize=(across / inch, len(canvas) / inch))
@@ -238,13 +243,43 @@ def strip_figure(
 
 def _gained(results: RunResults, name: str) -> str:
     """Write what an object's score was, is, and would be."""
-    words = {"ns": "before", "learned": "now", "matched": "if the target were known"}
     values = {
-        said: 100 * results.ap[which]["per_class"].get(name, float("nan"))
-        for which, said in words.items()
+        CALLED[which]: 100 * results.ap[which]["per_class"].get(name, float("nan"))
+        for which in ("ns", "learned", "matched")
         if which in results.ap
     }
     return "\n".join([f"{name}: {results.score}", *(f"{value:.0f} {said}" for said, value in values.items())])
+
+
+def bins_figure(results: RunResults, bins: Thumbnails, factor: str, rows: int = 2) -> Figure:
+    """Draw the bins of a factor as pictures of a few objects, with their shares of images before and after.
+
+    Args:
+        results: of the run.
+        bins: the pictures.
+        factor: whose bins.
+        rows: most objects, see ``strip_figure``.
+    """
+    chosen = [one for name in _first(results, rows) for one in results.of_factor(factor) if one.name == name]
+    columns = len(chosen[0].p["learned"])
+    figure = Figure(figsize=(1.05 * columns + 0.3, 1.5 * len(chosen)), layout="constrained")
+    panels = figure.subplots(len(chosen), columns, squeeze=False)
+    for row, one in enumerate(chosen):
+        for number in range(columns):
+            axes = panels[row, number]
+            axes.imshow(bins[one.name][factor][number].numpy())
+            axes.set(xticks=[], yticks=[])
+            before, after = (100 * one.p[which][number] for which in ("initial", "learned"))
+            axes.set_xlabel(f"bin {number + 1}\n{before:.0f} → {after:.0f} %", fontsize=8, color=INK)
+            for side in axes.spines.values():
+                side.set_color(METHOD_COLOURS["learned"] if after > 100 / columns else GRID)
+        panels[row, 0].set_ylabel(one.name, fontsize=9, color=INK)
+    return figure
+
+
+def _first(results: RunResults, count: int) -> list[str]:
+    """Return a few objects; those that start from another distribution than the target's come first."""
+    return [*results.biased, *(name for name in results.names if name not in results.biased)][:count]
 
 
 def _best_prediction(
@@ -276,6 +311,7 @@ def write_figures(
     detections: Sequence[Mapping[str, torch.Tensor]],
     folder: Path,
     before_and_after: tuple[LabelledImages, LabelledImages] | None = None,
+    bins: Thumbnails | None = None,
 ) -> list[Path]:
     """Write a run's figures as PNG files.
 
@@ -286,10 +322,13 @@ def write_figures(
         detections: on these, of the detector trained on the learned distribution; empty without.
         folder: where the files go.
         before_and_after: a few training images of every object, see ``strip_figure``; None: without that figure.
+        bins: pictures of every bin; None: without that figure.
     """
     made: dict[str, Figure] = {}
     if before_and_after is not None and results.ap:
         made["strip"] = strip_figure(results, test, *before_and_after)
+    for factor in next(iter(bins.values()), {}) if bins else ():
+        made[f"bins_{factor}"] = bins_figure(results, bins, factor)
     names = list(results.names)
     for factor in results.factors if results.moved else ():
         title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"

@@ -1,10 +1,12 @@
-"""What results depend on besides their settings: the commit of the code, and the machine."""
+"""What results depend on besides their settings: the command, the commit of the code, and the machine."""
 
 from __future__ import annotations
 
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ from typing import Any
 import torch
 
 PACKAGE = Path(__file__).parents[1]
+SMALLEST = "smoke"
+"""The choice of ``scale`` that tries that everything runs."""
 
 
 @cache
@@ -57,3 +61,46 @@ def gpu(device: torch.device | None) -> dict[str, Any]:
         "gpu_mb": held.total_memory / 2**20,
         "peak_gpu_mb": torch.cuda.max_memory_allocated(device) / 2**20,
     }
+
+
+@dataclass(frozen=True)
+class Made:
+    """How a run was made, for whoever reads its page.
+
+    Args:
+        command: that makes it again.
+        scale: the choice of ``scale``; empty: not known.
+        date: day and time of the report.
+        machine: see ``machine``.
+        shows: what its test images are, such as ``synthetic test images``.
+    """
+
+    command: str = ""
+    scale: str = ""
+    date: str = ""
+    machine: Mapping[str, Any] = field(default_factory=dict)
+    shows: str = "test images"
+
+    @property
+    def caution(self) -> str:
+        """What a reader must know before any score; empty if nothing."""
+        return caution(self.scale)
+
+    @property
+    def where(self) -> str:
+        """The machine in a few words."""
+        if not self.machine:
+            return ""
+        device = self.machine.get("device", "cpu")
+        name = self.machine["processor"] if device == "cpu" else device
+        cores = self.machine["cores"]
+        return f"{name}, {cores} core{'s' * (cores != 1)}"
+
+
+def caution(scale: str) -> str:
+    """Say of a scale that its scores mean nothing; empty for all that are meant to be read."""
+    return (
+        f"A trial (scale={scale}): it shows that everything runs, and its scores mean nothing."
+        if scale == SMALLEST
+        else ""
+    )

@@ -17,6 +17,17 @@ from neural_sim.detector.protocol import Score
 from neural_sim.documents import finite, write_json
 from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import merged, total_variation
+from neural_sim.report.provenance import Made
+
+CALLED = {
+    "ns": "before",
+    "learned": "after",
+    "matched": "if the target were known",
+    "synthetic_only": "after, no photographs",
+    "real_only": "photographs alone",
+    "views_only": "the fields' views alone",
+}
+"""What readers see for the names that detectors have in files, by what they were trained on."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +81,7 @@ class RunResults:
         real: how photographs trained (``mode``) and how many (``photographs``); empty without.
         score: what detectors are scored by: AP, or accuracy, which ``ap`` then has.
         shown: what the target's boxes show; empty where nobody read them.
+        made: how it was made.
     """
 
     experiment: str
@@ -92,6 +104,7 @@ class RunResults:
     real: Mapping[str, Any] = field(default_factory=dict)
     score: Score = "AP"
     shown: Sequence[FactorEstimate] = ()
+    made: Made = field(default_factory=Made)
 
     @property
     def moved(self) -> bool:
@@ -145,6 +158,10 @@ class RunResults:
                 "experiment": self.experiment,
                 "method": self.method,
                 "seed": self.seed,
+                "scale": self.made.scale,
+                "command": self.made.command,
+                "date": self.made.date,
+                "machine": self.made.machine,
                 "gap": self.config.get("gap", "disjoint"),
                 "biased": self.biased,
                 "psi": psi,
@@ -170,22 +187,25 @@ class RunResults:
     def summary(self) -> str:
         """Return the table printed at the end of a run."""
         columns = "".join(f"{name[:12]:>13}" for name in (*self.names, "mean"))
-        lines = [f"{f'{self.score} on the test set':<24}{columns}"]
+        lines = [self.made.caution] if self.made.caution else []
+        lines.append(f"{f'{self.score} on {self.made.shows}':<28}{columns}")
         for method, scores in self.ap.items():
             values = [*(scores["per_class"][name] for name in self.names), mean_of(scores)]
-            lines.append(f"{method:<24}" + "".join(f"{100 * value:>13.1f}" for value in values))
+            lines.append(
+                f"{CALLED.get(method, method):<28}" + "".join(f"{100 * value:>13.1f}" for value in values)
+            )
         if self.real:
             lines.append(
                 "trained on {photographs} photographs too (training.real.mode={mode})".format(**self.real)
             )
         if self.validation_ap is not None:
             score = f"{100 * self.validation_ap:.1f}"
-            lines.append(f"{self.score} on the validation images, learned: {score} (to choose settings by)")
+            lines.append(f"{self.score} on the validation images, after: {score} (to choose settings by)")
         for factor in self.factors if self.target_known else ():
             lines.append(f"distance to target, {factor}")
-            for which in ("initial", "learned"):
+            for which, called in (("initial", "before"), ("learned", "after")):
                 row = "".join(f"{one.distances[which]:>13.2f}" for one in self.of_factor(factor))
-                lines.append(f"  {which:<22}{row}")
+                lines.append(f"  {called:<26}{row}")
         lines += [one.sentence for one in self.shown]
         trust = untrusted(self.records)
         if trust["steps"]:

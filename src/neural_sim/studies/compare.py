@@ -22,6 +22,7 @@ from neural_sim.report.figures import Figure
 from neural_sim.report.intervals import bounds, points
 from neural_sim.report.page import render
 from neural_sim.report.page.verdict import POINTS, listed
+from neural_sim.report.provenance import caution
 from neural_sim.report.runs import FinishedRun, Group, LeftOut, Runs, by_reason, select
 from neural_sim.tasks.context import Context, Task
 
@@ -167,6 +168,11 @@ class Table:
         return ONLY_AT_END if self.comparison.only_at_end else ""
 
     @property
+    def cautions(self) -> list[str]:
+        """What a reader must know before all else."""
+        return cautions(self.group.runs)
+
+    @property
     def in_full(self) -> str:
         """The score's name."""
         return IN_FULL[self.comparison.score]
@@ -208,6 +214,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         f"Seed{'s' if c.several else ''} {', '.join(map(str, c.seeds))}; "
         f"{IN_FULL[c.score]} of {', '.join(runs[0].results['biased'])} in points, "
         f"with 95 % intervals over {'seeds and test images' if c.several else 'test images alone'}.",
+        *cautions(runs),
         *_on_other_devices(runs),
         _scores_table(c),
         f"{bold}Images, steps and seconds include the warm start, whose backbone every loop trains on; fields, which "
@@ -258,6 +265,12 @@ def _leads(c: Comparison) -> list[str]:
     rows = [[method, *(points(lead, sure=c.timed) for lead in leads)] for method, leads in c.ahead_at.items()]
     note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."
     return [markdown_table(head, rows), note]
+
+
+def cautions(runs: Sequence[FinishedRun]) -> list[str]:
+    """Return what a reader must know before the scores, of runs of a scale whose scores mean nothing."""
+    scales = dict.fromkeys(run.results.get("scale", "") for run in runs)
+    return [said for scale in scales if (said := caution(scale))]
 
 
 def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:

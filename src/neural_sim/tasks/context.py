@@ -70,6 +70,9 @@ class Context:
             can compose it.
         begun: when the task that runs began, in seconds since 1970.
         logged: seconds by phase that the log has.
+        command: that was typed, as one line.
+        scale: the choice of ``scale``.
+        last_words: what is printed when all tasks are done; empty: nothing.
     """
 
     config: dict[str, Any]
@@ -81,6 +84,9 @@ class Context:
     of_method: Callable[[str], Experiment] | None = None
     begun: float = field(default_factory=time.time)
     logged: dict[str, float] = field(default_factory=dict)
+    command: str = ""
+    scale: str = ""
+    last_words: str = ""
 
     @staticmethod
     def of(experiment: Experiment, folder: Path | None = None) -> Context:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import numpy as np
-from annotated_types import Ge, MinLen
+from annotated_types import Ge, Lt, MinLen
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
@@ -22,6 +22,7 @@ from neural_sim.digests import digest
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer, Quality
+from neural_sim.report.page.samples import write_samples_page
 from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import finer_fields
 from neural_sim.stages.psi_file import psi_of_file
@@ -41,6 +42,7 @@ _log = logging.getLogger(__name__)
 
 UNKNOWN_RADIUS = 100.0
 """Millimetres that stand for the radius of objects of unknown size in BOP's files."""
+Part = Annotated[float, Ge(0), Lt(1)]
 
 
 @validated
@@ -54,6 +56,8 @@ class ExportTask(Task):
             or the ``psi.json`` of an export.
         width, height: in pixels; null: those of the run's synthesised images.
         formats: some of ``coco``, ``yolo`` and ``bop``.
+        val_fraction: fraction of the images for validation, which COCO and YOLO name; 0: no split.
+        empty_fraction: fraction of the images that show no object.
         folder: null: ``dataset`` in the run's folder.
         image_format: ``jpg`` (quality 95, no chroma subsampling) or ``png``.
         quality: of the renders, ``draft``, ``normal`` or ``final``; null: the renderer's.
@@ -72,6 +76,8 @@ class ExportTask(Task):
     width: Annotated[int, Ge(8)] | None = None
     height: Annotated[int, Ge(8)] | None = None
     formats: Annotated[Sequence[Format], MinLen(1), Distinct()] = ("coco",)
+    val_fraction: Part = 0.1
+    empty_fraction: Part = 0.0
     folder: str | None = None
     image_format: ImageFormat = "jpg"
     quality: Quality | None = None
@@ -100,8 +106,11 @@ class ExportTask(Task):
             rows = psi_rows(distribution, data.source.psi, data.source.scene.names)
             write_whole(root / "psi.csv", psi_csv(rows))
             write_json(root / "psi.json", {"rows": rows, **_psi_identity(data)}, indent=1)
+            page = write_samples_page(root, records, data.source.scene.names, data.parts(records))
         labelled = sum(item["labelled"] for record in records for item in record["objects"])
-        print(f"{len(records)} images with {labelled} labelled objects\ndata set: {root}")
+        print(
+            f"{len(records)} images with {labelled} labelled objects\ndata set: {root}\nwhat is in it? open {page}"
+        )
 
     def _data_set(self, context: Context, root: Path) -> DataSet:
         x, graph = context.experiment, context.graph
@@ -129,15 +138,18 @@ class ExportTask(Task):
             "distribution": describe(distribution.drawn),
             "millimetres_per_radius": list(millimetres),
             "fields": [stage.key for stage in stages],
+            **({"empty_fraction": self.empty_fraction} if self.empty_fraction else {}),
             **self._look(renderer, synthesis),
         }
         ExportFolder(root, identity).check()  # before fields are fitted, which may take minutes
         for stage in context.results.free_first(context.shown(stages, "field")):
             context.results(stage)
-        source = ImageSource(context.results(scene), psi, camera, millimetres, x.run.seed)
+        source = ImageSource(
+            context.results(scene), psi, camera, millimetres, x.run.seed, self.empty_fraction
+        )
         return DataSet(
             source, root, models, identity, self.count, cast(Sequence[Format], tuple(self.formats)),
-            self.image_format, self.scene_size, farthest(source), workers,
+            self.image_format, self.scene_size, farthest(source), workers, self.val_fraction,
         )  # fmt: skip
 
     @contextmanager

@@ -16,6 +16,7 @@ from neural_sim.outer.preflight import expected_gains, photograph_gains
 from neural_sim.ranges import PositiveFraction, PositiveInt, validated
 from neural_sim.report.page.preflight import Preflight, write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
+from neural_sim.report.provenance import caution
 from neural_sim.stages.stage import Stage
 from neural_sim.target.mismatch import distance_factor, matching_settings, mismatches
 from neural_sim.tasks.context import Context, Task
@@ -77,9 +78,11 @@ class PreflightTask(Task):
             labelled=tuple(labelled),
             score=x.score,
             shown=results(graph.shown).factors,
+            caution=caution(context.scale),
         )
         document = dataclasses.asdict(report) | {"verdict": report.verdict, "worth": report.worth}
         write_json(context.folder / "preflight.json", document)
-        page = write_preflight_page(report, validation, images, context.folder)
+        bins = {stage.object: results(stage).bins for stage in graph.qualities}
+        page = write_preflight_page(report, validation, images, context.folder, bins)
         print(report.summary())
         print(f"is it worth it? open {page}")

@@ -16,6 +16,7 @@ from neural_sim.ranges import validated
 from neural_sim.report.bootstrap import Outcomes, match
 from neural_sim.report.intervals import points
 from neural_sim.report.page.verdict import Gain, verdict
+from neural_sim.report.run import CALLED
 from neural_sim.report.score_table import ScoreTable
 from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
@@ -99,8 +100,8 @@ def table(found: Sequence[ScoreTable], score: Score) -> str:
     differences = [(a, b) for a, b in SHOWN if {a, b} <= set(which)]
     head = [
         "",
-        *which,
-        *(f"{a} ahead of {b} by" for a, b in differences),
+        *(CALLED[detector] for detector in which),
+        *(f"{CALLED[a]} minus {CALLED[b]}" for a, b in differences),
         "one training's scatter",
         "over images",
     ]

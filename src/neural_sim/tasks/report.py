@@ -1,9 +1,10 @@
-"""Task ``report``: figures, the final training set, results.json, MLflow."""
+"""Task ``report``: the page, figures, the final training set, psi as a table, results.json, MLflow."""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,14 +14,17 @@ from typing_extensions import override
 
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.devices import peak_memory_mb, placed
+from neural_sim.documents import write_whole
 from neural_sim.report.coco import write_detections, write_training_set
 from neural_sim.report.figures import write_figures
 from neural_sim.report.identity import identity
-from neural_sim.report.page.run_page import PER_OBJECT, Shown, write_run_page
+from neural_sim.report.page.run_page import PER_OBJECT, RunPage, Shown
+from neural_sim.report.provenance import Made, machine
 from neural_sim.report.run import RunResults, write_results
 from neural_sim.stages.evaluate import Scores
 from neural_sim.stages.graph import Psi
 from neural_sim.stages.stage import Stage
+from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
 
@@ -51,18 +55,20 @@ class ReportTask(Task):
         drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
         shown = _shown(context, learned.last, test, scores)
         found, pair = scores["learned"].detections, (shown.before, shown.after)
-        write_figures(report, drawn.images, test, found, folder / "figures", pair)
+        write_figures(report, drawn.images, test, found, folder / "figures", pair, shown.bins)
         write_training_set(drawn, list(graph.names), folder / "training_set")
         write_detections(test, {called: part.detections for called, part in scores.items()}, folder)
+        write_whole(folder / "psi.csv", _psi_table(context, learned.last))
         _write_model(context, test)
         commands = _commands(context)
-        page = write_run_page(report, shown, commands, folder)
+        page = RunPage(report, shown)
+        path = page.write(commands, folder)
         print(report.summary())
         context.live.finish(report, folder)
         print(f"results: {folder}\n{context.live.where}")
         for what, command in commands.items():
             print(f"{what.lower()}: {command}")
-        print(f"did it work? open {page}")
+        context.last_words = f"{page.headline}\ndid it work? open {path}"
 
 
 def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str, Scores]) -> Shown:
@@ -72,7 +78,14 @@ def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str
         scene.training_set(each, max(PER_OBJECT.values()), graph.warm_start.generator()).images.to("cpu")
         for each in (graph.psi("initial"), psi)
     )
-    return Shown(before, after, test, {called: part.detections for called, part in scores.items()})
+    bins = {stage.object: context.results(stage).bins for stage in graph.qualities}
+    return Shown(before, after, test, {called: part.detections for called, part in scores.items()}, bins)
+
+
+def _psi_table(context: Context, psi: Psi) -> str:
+    """Return the learned distribution as CSV, as an export has it."""
+    distribution = context.experiment.imaging.distribution
+    return psi_csv(psi_rows(distribution, psi, context.graph.names))
 
 
 def _commands(context: Context) -> dict[str, str]:
@@ -140,6 +153,13 @@ def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool 
         real=_real(context),
         score=x.score,
         shown=learned.shown,
+        made=Made(
+            context.command,
+            context.scale,
+            time.strftime("%Y-%m-%d %H:%M"),
+            machine(graph.device),
+            "synthetic test images" if graph.renders_target else "test photographs",
+        ),
     )
 
 

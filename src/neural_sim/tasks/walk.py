@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,9 @@ from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.baseline.label_shift.settings import LabelShift
+from neural_sim.documents import parsed_json
 from neural_sim.outer.inner import pooled
+from neural_sim.outer.progress import duration
 from neural_sim.parameter.product import HardDraws
 from neural_sim.report.page.objects import ShownObject, write_objects_page
 from neural_sim.report.run_tracking import LiveRun
@@ -137,7 +139,9 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
     if wanted:
         missing = Counter(stage.phase for stage in context.results.check(wanted) if stage.stored)
         _log.info(
-            "to make: %s", ", ".join(f"{phase} {count}" for phase, count in missing.items()) or "nothing"
+            "to make: %s%s",
+            ", ".join(f"{phase} {count}" for phase, count in missing.items()) or "nothing",
+            forecast(context, missing),
         )
     if phases:
         context.account.left_out += omitted(
@@ -147,10 +151,35 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
         for name, task in tasks.items():
             with context.running(name):
                 task.run(context)
+    if context.last_words:
+        print(context.last_words)
     if not {"evaluate", "report"} & phases:
         return None
     # val steered psi too: a score to choose settings by, never one to report. Nothing of test is in it.
     return context.results(context.graph.validation(context.results(context.graph.learned))).ap.mean
+
+
+def forecast(context: Context, phases: Collection[str]) -> str:
+    """Say what phases took the last time that a run of this name, scale and method made them; empty if none did.
+
+    What that run found in the store counts as long as it took when it was made.
+    """
+    files = sorted(context.folder.parent.glob("*/results.json"), key=lambda path: -path.stat().st_mtime)
+    alike = {"scale": context.scale, "method": context.experiment.loop.method.name}
+    for path in files if context.scale else ():
+        try:
+            held = parsed_json(path.read_text(encoding="utf-8"))
+            if any(held.get(key) != value for key, value in alike.items()):
+                continue
+            spent = {phase: held["seconds"].get(phase, 0.0) for phase in phases}
+            for found in held["left_out"]:
+                if found["stage"] in spent:
+                    spent[found["stage"]] += found["seconds"] or 0.0
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):  # an older version wrote it
+            continue
+        if all(spent.values()):
+            return f": about {duration(sum(spent.values()))}, as on {held['date']}" if spent else ""
+    return ""
 
 
 def warn_of_uncovered(graph: Graph) -> None:

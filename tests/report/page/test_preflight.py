@@ -61,7 +61,7 @@ def test_the_page_is_self_contained(tmp_path):
     images = LabelledImages(
         torch.rand(4, 3, 24, 24), torch.zeros(4, 1, 4), torch.full((4, 1), -1), torch.zeros(4).long()
     )
-    page = write_preflight_page(preflight(0.001, 0.5), images, images, tmp_path).read_text()
+    page = write_preflight_page(preflight(0.001, 0.5), images, images, tmp_path, {}).read_text()
     assert "Worth optimising: object 0" in page and "Box size differs" in page
     assert all(source.startswith("data:image/") for source in re.findall(r'src="([^"]*)"', page))
 
@@ -83,5 +83,5 @@ def test_what_the_target_shows_is_said_and_drawn(tmp_path):
     images = LabelledImages(
         torch.rand(2, 3, 24, 24), torch.zeros(2, 1, 4), torch.full((2, 1), -1), torch.zeros(2).long()
     )
-    page = write_preflight_page(report, images, images, tmp_path).read_text()
+    page = write_preflight_page(report, images, images, tmp_path, {}).read_text()
     assert "What the target shows" in page and page.count('alt="what the target shows') == 2 and said in page

@@ -1,6 +1,7 @@
 """report.html: self-contained, with every part that the run has, and readable by a browser."""
 
 import dataclasses
+import html
 import re
 import shutil
 import subprocess
@@ -9,7 +10,10 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
-from neural_sim.report.page.run_page import Shown, write_run_page
+from neural_sim.report.page import run_page
+from neural_sim.report.page.psi import learned_psi
+from neural_sim.report.page.run_page import RunPage, Shown, write_run_page
+from neural_sim.report.provenance import Made
 from neural_sim.report.run import RunResults
 from neural_sim.types import LabelledImages
 
@@ -92,7 +96,7 @@ def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, 
     (tmp_path / "results.json").write_text("{}")
     page = write_run_page(results, shown, COMMANDS, tmp_path).read_text()
     assert headings(page) == [
-        "Detectors", "What was learned", "Training images", "Detections on test images", "What is still weak",
+        "Scores", "What was learned", "What is still weak", "Training images", "Detections on test images",
         "How far to trust it", "What it cost", "Next",
     ]  # fmt: skip
     assert "In one training of each, the learned distribution gave" in page and "more on mug" in page
@@ -129,7 +133,7 @@ def test_a_page_says_that_photographs_have_an_unknown_distribution(results, show
         "the learned distribution gave" in text
         and "The target's is not known: its images are photographs." in text
     )
-    assert not re.search("matched|distance|the target's own", text)
+    assert not re.search("if the target were known|distance|the target's own", text)
 
 
 def test_a_classification_s_page_speaks_of_accuracy(results, shown, tmp_path):
@@ -143,7 +147,7 @@ def test_a_classification_s_page_speaks_of_accuracy(results, shown, tmp_path):
     points = [{**point, "ap": scores["ns"]} for point in results.curve]
     found = dataclasses.replace(results, score="accuracy", ap=scores, curve=points)
     page = write_run_page(found, dataclasses.replace(shown, detections=moved), COMMANDS, tmp_path).read_text()
-    assert "gave 50.0 points of accuracy more on mug" in page and "Accuracy on the test set" in page
+    assert "gave 50.0 points of accuracy more on mug" in page and "Accuracy: the fraction of a class" in page
     assert all(text in page for text in ("Won (12 of 24)", "Still wrong (6 of 24)", "Right (6 of 24)"))
     text = re.sub(r'src="[^"]*"', "", page)
     assert "the best class is the right one" in text and not re.search(r"\bAP\b|average precision", text)
@@ -177,3 +181,79 @@ def test_a_browser_shows_the_page_without_a_sideways_scroll(results, shown, tmp_
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     inner, scroll, count, _ = map(int, re.search(r"<title>([\d,]+)</title>", done.stdout).group(1).split(","))
     assert scroll <= inner and count > 20
+
+
+def thumbnails(*names):
+    return {name: {"pose": torch.randint(0, 256, (4, 8, 8, 3), dtype=torch.uint8)} for name in names}
+
+
+def test_a_page_says_how_it_was_made_and_warns_of_a_trial(results, shown, tmp_path):
+    made = Made("python -m src.main scale=smoke", "smoke", "2026-11-29 03:00", {"processor": "x86", "cores": 2},
+                "synthetic test images")  # fmt: skip
+    page = RunPage(dataclasses.replace(results, made=made), shown)
+    text = page.write({}, tmp_path).read_text()
+    assert "2026-11-29 03:00 · scale=smoke · x86, 2 cores" in text and made.command in text
+    assert f'<p class="caution">{made.caution}</p>' in text and "its scores mean nothing" in made.caution
+    assert "over synthetic test images)" in page.headline and page.headline in html.unescape(text)
+    quick = RunPage(dataclasses.replace(results, made=dataclasses.replace(made, scale="quick")), shown)
+    assert 'class="caution"' not in quick.write({}, tmp_path).read_text()
+
+
+def test_every_bin_is_pictured_with_its_share_and_its_score(results, shown, tmp_path):
+    one = dataclasses.replace(results, symmetric_bins={"can": {"pose": [[1, 3], [2], [4]]}})
+    page = write_run_page(
+        one, dataclasses.replace(shown, bins=thumbnails("mug", "can")), {}, tmp_path
+    ).read_text()
+    assert page.count('alt="mug from bin') > 4 and page.count('alt="can from bin') >= 4
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", re.sub(r'src="[^"]*"', "", page)))
+    # The mug goes from a quarter to 0.85 in bin 1, as in the target; all images of bin 1 are right, half of bin 2.
+    assert "bin 1 25 → 85 % (85) AP 38 → 100" in text and "bin 2 25 → 5 % (5) AP 0 → 38" in text
+    assert "bin 1 (looks like 3)" in text
+    assert re.search(
+        r"mug from bin 2 : about 30\.9 AP of this object to win\. AP 38 on 6 test images, 50 %", text
+    )
+    assert "bin 1 has 100; training on the target&#39;s own distribution reaches 100 here" in text
+
+
+def test_what_was_forgotten_is_told_by_bin_with_its_share(results, shown, tmp_path):
+    """Bin 1 of the mug was found before, and is not now."""
+    before = [{**each, "boxes": shown.test.boxes[i]} for i, each in enumerate(shown.detections["ns"])]
+    after = [
+        {**each, "boxes": shown.test.boxes[i] + (18.0 if i < 12 and i % 2 == 0 else 0.0)}
+        for i, each in enumerate(before)
+    ]
+    lost = dataclasses.replace(shown, detections={**shown.detections, "ns": before, "learned": after})
+    page = write_run_page(results, lost, {}, tmp_path).read_text()
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", "", page))
+    assert "mug from bin 1: AP 100 before, 0 after (a loss of 100 to 100) on 6 test images, 50 %" in text
+    assert "went from 25 to 85 %" in text and text.count("before, 0 after") == 1
+
+
+def test_a_curve_is_drawn_of_three_points_or_more_with_labels_that_do_not_meet(results, shown, tmp_path):
+    alt = 'alt="AP against seconds"'
+    assert alt not in write_run_page(results, shown, {}, tmp_path).read_text()
+    points = [{**results.curve[0], "seconds": at} for at in (0.0, 1.0, 50.0, 99.0, 100.0)]
+    assert alt in write_run_page(dataclasses.replace(results, curve=points), shown, {}, tmp_path).read_text()
+    assert sorted(run_page._apart([0.0, 1.0, 50.0, 99.0, 100.0])) == [1, 2, 4]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"taken_back": {"can": {"kept": 0, "accepted": 2, "gain": 0.1}}}, "went back to its start"),
+        ({}, "It did not move: its derivative was never told from zero."),
+        ({"verdicts": {"can": {"accepted": False}}}, "It did not move: trainings rejected its steps."),
+    ],
+)
+def test_a_psi_that_stays_or_falls_back_is_commented(results, change, said):
+    first, _ = results.records
+    own = {"taken_back": {}, "verdicts": {}, "certificate": first["certificate"], **change}
+    one = dataclasses.replace(results, records=[{**first, **own}])
+    comments = {psi.name: psi.comment for psi in learned_psi(one, {}, [])["pose"]}
+    assert said in comments["can"] and comments["mug"] == ""
+
+
+def test_a_psi_that_leaves_the_target_is_commented(results):
+    p = {**results.probabilities, "target": results.probabilities["initial"]}
+    (mug, _) = learned_psi(dataclasses.replace(results, probabilities=p), {}, [])["pose"]
+    assert mug.comment == "It moved away from the target."

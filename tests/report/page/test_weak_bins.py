@@ -1,9 +1,11 @@
 """AP by bin, where the detections of every bin are known."""
 
+import dataclasses
+
 import pytest
 import torch
 
-from neural_sim.report.page.weak_bins import bin_scores, weakest
+from neural_sim.report.page.weak_bins import BinScore, bin_scores, forgotten, weaknesses
 from neural_sim.types import LabelledImages
 
 BOX = torch.tensor([[2.0, 2.0, 10.0, 10.0]])
@@ -36,9 +38,40 @@ def test_a_bin_scores_on_its_own_images():
     assert [s.last for s in scores] == pytest.approx([1.0, 0.5, 0.6], abs=0.02)
     assert [s.change for s in scores] == [s.last for s in scores]
     assert [s.fraction for s in scores] == [0.5, 0.5, 5 / 8]
-    # 5 of b's 8 images lack 0.4, 10 of a's 20 lack 0.5.
-    assert weakest(scores, 2) == [scores[2], scores[1]]
-    assert [s.missing for s in scores] == pytest.approx([0.0, 0.25, 0.25], abs=0.01)
+    # Half of a's images score 0.5 less than its best bin; b has one bin, and nothing to hold it against.
+    (weak,) = weaknesses(scores)
+    assert weak.score == scores[1] and weak.best == scores[0] and weak.gain == pytest.approx(0.25, abs=0.01)
+    assert weak.reason == "bin 1 has 100"
+
+
+def test_a_bin_is_held_against_the_detector_of_the_target_too():
+    one = BinScore("a", 1, 10, 0.8, {"ns": 0.2, "learned": 0.5, "matched": 0.7})
+    (weak,) = weaknesses([one])
+    assert weak.gain == pytest.approx(0.16) and "reaches 70 here, so a larger share helps" in weak.reason
+    best = BinScore("a", 2, 10, 0.2, {"ns": 0.2, "learned": 0.9, "matched": 0.9})
+    (weak,) = weaknesses([dataclasses.replace(one, ap={**one.ap, "matched": 0.55}), best])
+    assert weak.gain == pytest.approx(0.32) and weak.reason.startswith("bin 2 has 90; ")
+    assert "its share hardly" in weak.reason
+
+
+def test_what_was_forgotten_is_certain_and_ordered_by_what_it_costs():
+    bins, labels = torch.tensor([0] * 24 + [1] * 6 + [2] * 6), torch.zeros(36).long()
+    before, after = torch.ones(36, dtype=torch.bool), torch.ones(36, dtype=torch.bool)
+    after[:24], after[24:30] = torch.arange(24) % 3 > 0, False
+    after[30] = False  # one of six is no certain loss
+    found, test = (
+        {"ns": detections(labels, before), "learned": detections(labels, after)},
+        images(bins, labels),
+    )
+    lost = forgotten(bin_scores(["a"], found, test), ["a"], found, test)
+    assert [one.score.bin for one in lost] == [1, 2] and lost[1].loss.value == pytest.approx(1.0)
+    assert 0.0 < lost[0].loss.low < lost[0].loss.value < lost[0].loss.high < 0.6
+    assert (
+        forgotten(
+            bin_scores(["a"], {"ns": found["learned"], "learned": found["ns"]}, test), ["a"], found, test
+        )
+        == []
+    )
 
 
 def test_bins_of_boxes_count_for_their_own_object():

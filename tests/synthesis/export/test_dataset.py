@@ -9,6 +9,7 @@ import pytest
 from small_export import data_of
 
 from neural_sim.synthesis.export import dataset as module
+from neural_sim.synthesis.export.images import GOLDEN, SILVER, spread
 
 
 def written(data, shown=lambda numbers: numbers):
@@ -144,3 +145,41 @@ def test_the_manifest_has_hashes_and_poses(whole):
             pose = np.array(item["camera_to_world"])
             assert np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-12
             assert np.linalg.norm(pose[:3, 3]) == pytest.approx(item["distance"])
+
+
+def test_images_for_validation_are_spread_and_stay_so_when_a_set_grows(boxes, tmp_path):
+    root = tmp_path / "data"
+    written(data_of(boxes, root, count=5, val_fraction=0.3))
+    assert (root / "val.txt").read_text() == "./images/000001.png\n./images/000004.png\n"
+    assert (root / "dataset.yaml").read_text().startswith("train: train.txt\nval: val.txt\nnc: 3\n")
+    written(data_of(boxes, root, val_fraction=0.3))
+    assert (root / "segment" / "val.txt").read_text() == "./images/000001.png\n./images/000004.png\n"
+    whole, train, val = (
+        json.loads((root / f"annotations{part}.json").read_text()) for part in ("", "_train", "_val")
+    )
+    assert [image["id"] for image in val["images"]] == [2, 5]
+    assert sorted(image["id"] for image in (*train["images"], *val["images"])) == [1, 2, 3, 4, 5, 6, 7]
+    assert len(train["annotations"]) + len(val["annotations"]) == len(whole["annotations"])
+    written(data_of(boxes, root))  # without a split nothing of the old one is left in use
+    assert not (root / "annotations_val.json").exists()
+    assert "no split is made" in (root / "dataset.yaml").read_text()
+    thousand = [number for number in range(1000) if spread(number, 0.1, GOLDEN)]
+    assert abs(len(thousand) - 100) <= 1
+    assert all(abs(sum(number % 6 == label for number in thousand) - 100 / 6) < 4 for label in range(6))
+
+
+def test_too_few_images_are_not_parted_and_that_is_said(boxes, tmp_path, caplog):
+    written(data_of(boxes, tmp_path / "data", count=2, val_fraction=0.1))
+    assert "2 images are too few to part them" in caplog.text
+    assert "no split is made" in (tmp_path / "data" / "dataset.yaml").read_text()
+
+
+def test_a_fraction_of_the_images_shows_no_object_and_the_others_are_the_same(boxes, whole, tmp_path):
+    data = data_of(boxes, tmp_path / "data")
+    data = dataclasses.replace(data, source=dataclasses.replace(data.source, empty=0.3))
+    records = written(data)
+    empty = [record["number"] for record in records if not record["objects"]]
+    assert empty
+    for record, before in zip(records, whole[1], strict=True):
+        assert record["objects"] == ([] if spread(record["number"], 0.3, SILVER) else before["objects"])
+        assert (tmp_path / "data" / "labels" / f"{record['number']:06d}.txt").is_file()

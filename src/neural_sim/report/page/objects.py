@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from jaxtyping import UInt8
-from PIL import Image
-from torch import Tensor
 
 from neural_sim.documents import write_whole
 from neural_sim.field.quality import POOR, Quality
 from neural_sim.parameter.coverage import Coverage
 from neural_sim.report.page import render
+from neural_sim.report.page.pictures import picture
 
 FILE = "objects.html"
 
@@ -68,14 +63,6 @@ class ShownObject:
                 said = "" if known is None else f": {known.fractions[number]:.0%} seen"
                 tiles.append((picture(image), f"{factor} {number + 1}{said}", not open_))
             yield factor, tiles
-
-
-def picture(image: UInt8[Tensor, "h w c"]) -> str:
-    """Return an image as the source of an ``<img>``."""
-    pixels = image.numpy()
-    buffer = io.BytesIO()
-    Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(buffer, "JPEG", quality=88)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def write_objects_page(experiment: str, objects: Sequence[ShownObject], folder: Path) -> Path:

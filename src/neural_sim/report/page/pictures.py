@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
@@ -57,8 +58,7 @@ def detected(
         best = _best(detections[row], len(truth))
         parts = zip(best["labels"].tolist(), best["scores"].tolist(), strict=True)
         caption = ", ".join(f"{names[label]} {score:.2f}" for label, score in parts) or "nothing"
-        picture = _drawn(images.images[row], best["boxes"], best["labels"], truth)
-        pictures.append(Picture(picture, caption))
+        pictures.append(Picture(_drawn(images.images[row], best["boxes"], best["labels"], truth), caption))
     return pictures
 
 
@@ -88,14 +88,25 @@ def _best(detections: Mapping[str, Tensor], objects: int) -> dict[str, Tensor]:
 
 def _drawn(image: Tensor, boxes: Tensor, labels: Tensor, truth: Tensor | None = None) -> str:
     pixels = image.detach().clamp(0, 1).mul(255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
-    picture = Image.fromarray(pixels)
-    scale = max(1, -(-SHORTEST // min(picture.size)))
-    picture = picture.resize((scale * picture.width, scale * picture.height), Image.Resampling.BICUBIC)
-    pen = ImageDraw.Draw(picture)
+    large = Image.fromarray(pixels)
+    scale = max(1, -(-SHORTEST // min(large.size)))
+    large = large.resize((scale * large.width, scale * large.height), Image.Resampling.BICUBIC)
+    pen = ImageDraw.Draw(large)
     for box in [] if truth is None else (scale * truth).tolist():
         pen.rectangle(box, outline="white", width=2)
     for box, label in zip((scale * boxes).tolist(), labels.tolist(), strict=True):
         pen.rectangle(box, outline=CLASS_COLOURS[label % len(CLASS_COLOURS)], width=3)
+    return jpeg(large)
+
+
+def picture(image: UInt8[Tensor, "h w c"]) -> str:
+    """Return an image as the source of an ``<img>``."""
+    pixels = image.numpy()
+    return jpeg(Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels), quality=88)
+
+
+def jpeg(image: Image.Image, quality: int = 85) -> str:
+    """Return a picture as the source of an ``<img>``."""
     buffer = io.BytesIO()
-    picture.save(buffer, format="JPEG", quality=85)
+    image.save(buffer, format="JPEG", quality=quality)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -12,10 +12,12 @@ from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import write_whole
 from neural_sim.outer.preflight import ExpectedGains, PhotographGain, equivalent
+from neural_sim.report.figures import Thumbnails
 from neural_sim.report.page import pictures, render
-from neural_sim.report.page.run_page import shown_chart
+from neural_sim.report.page.pictures import picture
+from neural_sim.report.page.psi import shown_chart
 from neural_sim.report.page.verdict import listed
-from neural_sim.report.page.weak_bins import BinScore, by_object, weakest
+from neural_sim.report.page.weak_bins import BinScore, by_object, weaknesses
 from neural_sim.target.mismatch import Mismatch
 from neural_sim.types import LabelledImages
 
@@ -40,6 +42,7 @@ class Preflight:
         labelled: what numbers of labelled photographs in training are worth; empty where none are for training.
         score: what detectors are scored by.
         shown: what the target's boxes show.
+        caution: what a reader must know before all else; empty: nothing.
     """
 
     experiment: str
@@ -53,6 +56,7 @@ class Preflight:
     labelled: tuple[PhotographGain, ...] = ()
     score: Score = "AP"
     shown: tuple[FactorEstimate, ...] = ()
+    caution: str = ""
 
     @property
     def promising(self) -> list[ExpectedGains]:
@@ -68,6 +72,10 @@ class Preflight:
     @property
     def verdict(self) -> str:
         """Whether an optimisation is worth it, in one sentence."""
+        return f"{self.caution} {self._verdict}" if self.caution else self._verdict
+
+    @property
+    def _verdict(self) -> str:
         if not self.promising:
             return (
                 "Not worth optimising as it is configured: no object's derivative can be told from zero, so the loop "
@@ -118,7 +126,7 @@ class Preflight:
             lines.append(
                 f"{f.name[:13]:<14}{f.factor[:13]:<14}{f.p_value:>9.2g}{f.step:>9.4f}{f.step_error:>9.4f}  {gain}"
             )
-        for score in weakest(self.bins):
+        for score in self.weak:
             lines.append(
                 f"weak: {score.name} from bin {score.bin}, {self.score} {100 * score.last:.1f} on {score.images} images"
             )
@@ -127,6 +135,11 @@ class Preflight:
         for advice in self.advice:
             lines.append(f"would match: {advice}")
         return "\n".join(lines)
+
+    @property
+    def weak(self) -> list[BinScore]:
+        """The bins where most would be won."""
+        return [weakness.score for weakness in weaknesses(self.bins, 3)]
 
     @property
     def differing(self) -> list[Mismatch]:
@@ -144,9 +157,9 @@ class Preflight:
 
 
 def write_preflight_page(
-    report: Preflight, target: LabelledImages, synthesised: LabelledImages, folder: Path
+    report: Preflight, target: LabelledImages, synthesised: LabelledImages, folder: Path, bins: Thumbnails
 ) -> Path:
-    """Write preflight.html; images of both sets, spread over them, are side by side."""
+    """Write preflight.html; images of both sets, spread over them, are side by side, and ``bins`` are pictured."""
     sides = {
         called: pictures.labelled(
             images, torch.linspace(0, len(images) - 1, min(SHOWN, len(images))).long().tolist(), report.names
@@ -157,10 +170,15 @@ def write_preflight_page(
         )
     }
     largest = max((abs(gain) for f in report.foreseen for gain in f.by_bin), default=0.0) or 1.0
+    thumbnails = {
+        (name, factor): [picture(image) for image in images]
+        for name, own in bins.items()
+        for factor, images in own.items()
+    }
     path = folder / FILE
     text = render.page(
         "preflight.html", title=f"{report.experiment}: preflight", report=report, sides=sides, largest=largest,
         shown=[(shown_chart(one), one) for one in report.shown],
-        bins=by_object(report.bins), weak=weakest(report.bins), promising=report.promising,
+        bins=by_object(report.bins), promising=report.promising, thumbnails=thumbnails,
     )  # fmt: skip
     return write_whole(path, text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -20,6 +21,11 @@ _pages = Environment(
 )
 
 
+def whole(value: float) -> str:
+    """Write a fraction in whole points."""
+    return f"{100.0 * value:z.0f}"
+
+
 def percent(value: float | None) -> str:
     """Write a fraction in points with one decimal; a dash for no value."""
     return "–" if value is None or value != value else f"{100.0 * value:.1f}"
@@ -30,12 +36,19 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-_pages.filters |= {"percent": percent, "capital": capital}
+_pages.filters |= {"percent": percent, "whole": whole, "capital": capital}
 
 
 def page(template: str, **values: Any) -> str:
     """Fill the named template with values."""
     return _pages.get_template(template).render(**values)
+
+
+def png_uri(path: Path) -> str | None:
+    """Return a PNG file as the source of an ``<img>``; None where there is no such file."""
+    if not path.is_file():
+        return None
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def data_uri(figure: Figure) -> str:

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.colors import to_hex
 from torch import Tensor
 
-from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import write_whole
 from neural_sim.outer.certificate import untrusted
 from neural_sim.report import figures
 from neural_sim.report.bootstrap import match
-from neural_sim.report.figures import Figure
+from neural_sim.report.figures import Figure, Thumbnails
 from neural_sim.report.page import pictures, render
 from neural_sim.report.page.pictures import Picture
+from neural_sim.report.page.psi import learned_psi, shown_chart
 from neural_sim.report.page.steps import step_rows
 from neural_sim.report.page.verdict import POINTS, Gain, listed, verdict
-from neural_sim.report.page.weak_bins import bin_scores, by_object, weakest
-from neural_sim.report.run import Learned, RunResults
+from neural_sim.report.page.weak_bins import BinScore, bin_scores, forgotten, weaknesses
+from neural_sim.report.run import CALLED, RunResults
 from neural_sim.report.score_table import ScoreTable
 from neural_sim.types import LabelledImages
 
@@ -35,6 +35,22 @@ EXAMPLES = 8
 """Detections shown of a kind."""
 DRAWS = 200
 """Resampled test sets of an interval."""
+FEWEST = 3
+"""Scored iterations of a curve; a start and an end are in the table."""
+FILES = {
+    "results.json": "all numbers",
+    "psi.csv": "the learned distribution as a table, for any renderer",
+    "objects.html": "whether the fields show their objects",
+    "detections.json": "detections on the test images",
+    "training_set/annotations.json": "training images with boxes and poses",
+    "model.safetensors": "the detector",
+    "model.onnx": "the detector for onnxruntime",
+    "figures/strip.png": "the run in one picture",
+    "figures/ap.png": "scores",
+    "main.log": "what the run said",
+    ".hydra/config.yaml": "all settings",
+}
+"""Files that a reader may open next, beside the page."""
 
 
 @dataclass(frozen=True)
@@ -46,30 +62,14 @@ class Shown:
         after: the same from the learned distribution, drawn with the same random numbers.
         test: the test images.
         detections: on these, of ns, learned and, where it is known, matched; empty without scores.
+        bins: pictures of every bin.
     """
 
     before: LabelledImages
     after: LabelledImages
     test: LabelledImages
     detections: Mapping[str, Sequence[Mapping[str, Tensor]]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class PsiChart:
-    """One object's distribution of a factor: the chart, and its distances from the target (empty: not known)."""
-
-    name: str
-    chart: str
-    distances: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class FactorCharts:
-    """The charts of a factor, with the colours of its bins."""
-
-    factor: str
-    colours: tuple[str, ...]
-    charts: tuple[PsiChart, ...]
+    bins: Thumbnails = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -81,58 +81,99 @@ class ScoreRow:
     ap: Mapping[str, float | None]
 
 
+@dataclass(frozen=True)
+class RunPage:
+    """The page of a run, and its first sentence."""
+
+    results: RunResults
+    shown: Shown
+
+    @cached_property
+    def gains(self) -> dict[str, Gain]:
+        """Gains of the objects that the run is about, of all others, and of each of these that certainly lost."""
+        results = self.results
+        if not self.shown.detections:
+            return {}
+        same = results.target_known and all(one.p["initial"] == one.p["target"] for one in results.learned)
+        table = score_table(self.shown, results.names, results.score)
+
+        def gain(names: Sequence[str]) -> Gain:
+            return Gain.of(table.of_classes(names), same)
+
+        gains = {"aim": gain([name for name in self.aim if name in table.shown] or table.shown)}
+        others = [name for name in table.shown if name not in self.aim]
+        if others:
+            gains["others"] = gain(others)
+            each = {name: gain([name]) for name in others}
+            gains |= {f"lost:{name}": g for name, g in each.items() if g.outcome == "worse"}
+        return gains
+
+    @property
+    def aim(self) -> list[str]:
+        """The objects that the run is about."""
+        return list(self.results.biased) or list(self.results.names)
+
+    @property
+    def headline(self) -> str:
+        """Say in one sentence whether it worked."""
+        return verdict(self.gains.get("aim"), self.results.score, images=self.results.made.shows)
+
+    @cached_property
+    def bins(self) -> list[BinScore]:
+        """Scores by bin of the test images."""
+        compared = {w: d for w, d in self.shown.detections.items() if w in ("ns", "learned", "matched")}
+        names, score = list(self.results.names), self.results.score
+        return bin_scores(names, compared, self.shown.test, score=score) if compared else []
+
+    def write(self, commands: Mapping[str, str], folder: Path) -> Path:
+        """Write report.html. Its pictures are in it; it links to its neighbours in ``folder`` alone.
+
+        ``commands`` are what to run next, by what it does.
+        """
+        results, shown = self.results, self.shown
+        names = list(results.names)
+        psi = learned_psi(results, shown.bins, self.bins)
+        tiles = {
+            (one.name, tile.number): tile
+            for own in psi.values()
+            for one in own
+            for tile in one.tiles
+            if tile.score
+        }
+        text = render.page(
+            "run.html",
+            title=f"{results.experiment}: {results.method}, seed {results.seed}",
+            results=results,
+            made=results.made,
+            called=CALLED,
+            verdict=self.headline,
+            points=POINTS[results.score],
+            others=self.gains.get("others"),
+            lost=[gain for key, gain in self.gains.items() if key.startswith("lost:")],
+            strip=render.png_uri(folder / "figures" / "strip.png"),
+            psi=psi,
+            tiles=tiles,
+            shown=[(shown_chart(one), one) for one in results.shown],
+            rows=_score_rows(results),
+            curve=_curve(results, self.aim),
+            aim=listed(self.aim),
+            before=_training(shown.before, results),
+            after=_training(shown.after, results),
+            examples=_examples(shown, names, results.score) if shown.detections else {},
+            steps=step_rows(results.records, names),
+            trust=untrusted(results.records),
+            bins=bool(self.bins),
+            weak=weaknesses(self.bins),
+            forgotten=forgotten(self.bins, names, shown.detections, shown.test, results.score),
+            commands=commands,
+            files={name: what for name, what in FILES.items() if (folder / name).exists()},
+        )
+        return write_whole(folder / FILE, text)
+
+
 def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str], folder: Path) -> Path:
-    """Write report.html, without references to other files but links to its neighbours in ``folder``.
-
-    ``commands`` are what to run next, by what it does.
-    """
-    names, scored = list(results.names), bool(shown.detections)
-    aim = list(results.biased) or names
-    gains = _gains(results, aim, shown) if scored else {}
-    both = {which: shown.detections[which] for which in ("ns", "learned")} if scored else {}
-    scores = bin_scores(names, both, shown.test, score=results.score) if scored else []
-    text = render.page(
-        "run.html",
-        title=f"{results.experiment}: {results.method}, seed {results.seed}",
-        results=results,
-        verdict=verdict(gains.get("aim"), results.score),
-        points=POINTS[results.score],
-        others=gains.get("others"),
-        lost=[gain for key, gain in gains.items() if key.startswith("lost:")],
-        psi=_psi(results),
-        shown=[(shown_chart(one), one) for one in results.shown],
-        rows=_score_rows(results),
-        curve=_curve(results, aim),
-        aim=listed(aim),
-        before=_training(shown.before, results),
-        after=_training(shown.after, results),
-        examples=_examples(shown, names, results.score) if scored else {},
-        steps=step_rows(results.records, names),
-        trust=untrusted(results.records),
-        bins=by_object(scores),
-        weak=weakest([s for s in scores if s.name in aim]),
-        commands=commands,
-        files=_files(folder),
-    )
-    path = folder / FILE
-    return write_whole(path, text)
-
-
-def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, Gain]:
-    """Return gains of the objects that the run is about, of all others, and of each of these that certainly lost."""
-    same = results.target_known and all(one.p["initial"] == one.p["target"] for one in results.learned)
-    table = score_table(shown, results.names, results.score)
-
-    def gain(names: Sequence[str]) -> Gain:
-        return Gain.of(table.of_classes(names), same)
-
-    gains = {"aim": gain([name for name in aim if name in table.shown] or table.shown)}
-    others = [name for name in table.shown if name not in aim]
-    if others:
-        gains["others"] = gain(others)
-        each = {name: gain([name]) for name in others}
-        gains |= {f"lost:{name}": g for name, g in each.items() if g.outcome == "worse"}
-    return gains
+    """Write report.html, see ``RunPage.write``."""
+    return RunPage(results, shown).write(commands, folder)
 
 
 def score_table(shown: Shown, names: Sequence[str], score: Score) -> ScoreTable:
@@ -143,17 +184,6 @@ def score_table(shown: Shown, names: Sequence[str], score: Score) -> ScoreTable:
         if which in shown.detections
     }
     return ScoreTable.of(outcomes, names, DRAWS)
-
-
-def _psi(results: RunResults) -> list[FactorCharts]:
-    """Return charts of what was learned, the biased objects' first; none where nothing was."""
-    drawn = []
-    for factor in results.factors if results.moved else ():
-        learned = sorted(results.of_factor(factor), key=lambda one: one.name not in results.biased)
-        panels = [PsiChart(one.name, psi_chart(one), one.distances) for one in learned]
-        colours = bin_colours(factor, len(learned[0].p["learned"]))
-        drawn.append(FactorCharts(factor, tuple(colours), tuple(panels)))
-    return drawn
 
 
 def _score_rows(results: RunResults) -> list[ScoreRow]:
@@ -169,32 +199,13 @@ def _score_rows(results: RunResults) -> list[ScoreRow]:
 
 
 def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
-    if len(results.curve) < 2:
+    if len(results.curve) < FEWEST:
         return None
     bounds = {}
     if "matched" in results.ap:
         per_class = results.ap["matched"]["per_class"]
-        bounds = {"matched": sum(per_class[name] for name in aim) / len(aim)}
+        bounds = {CALLED["matched"]: sum(per_class[name] for name in aim) / len(aim)}
     return curve_chart(results.curve, list(aim), bounds, results.score)
-
-
-def bin_colours(factor: str, bins: int) -> list[str]:
-    """Return the colours of a factor's bins in these charts, for a legend."""
-    return [to_hex(colour) for colour in figures.bin_colours(factor, bins)]
-
-
-def shown_chart(one: FactorEstimate) -> str:
-    """Draw what the target shows of one object and factor, with psi's bars next to it."""
-    figure = Figure(figsize=(3.4, 1.9), layout="constrained")
-    figures.shown_panel(figure.add_subplot(), one)
-    return render.data_uri(figure)
-
-
-def psi_chart(learned: Learned) -> str:
-    """Draw one object's probabilities over the iterations, with the target's next to them."""
-    figure = Figure(figsize=(3.4, 2.1), layout="constrained")
-    figures.psi_panel(figure.add_subplot(), learned)
-    return render.data_uri(figure)
 
 
 def curve_chart(
@@ -216,18 +227,27 @@ def curve_chart(
     seconds = [point["seconds"] for point in curve]
     ap = [100.0 * sum(point["ap"]["per_class"][name] for name in names) / len(names) for point in curve]
     axes.plot(seconds, ap, "o-", color=figures.METHOD_COLOURS["learned"], linewidth=1.6, markersize=5)
-    for value, spent in zip(ap, seconds, strict=True):
-        axes.annotate(f"{value:.1f}", (spent, value), textcoords="offset points", xytext=(0, 6), ha="center",
-                      fontsize=8, color=figures.INK)  # fmt: skip
+    for place in _apart(seconds):
+        axes.annotate(f"{ap[place]:.1f}", (seconds[place], ap[place]), textcoords="offset points", xytext=(0, 6),
+                      ha="center", fontsize=8, color=figures.INK)  # fmt: skip
     for name, value in bounds.items():
-        axes.axhline(100.0 * value, color=figures.MUTED, linestyle="--", linewidth=1)
-        axes.annotate(name, (1.0, 100.0 * value), xycoords=("axes fraction", "data"), ha="right", va="bottom",
-                      fontsize=8, color=figures.MUTED)  # fmt: skip
+        axes.axhline(100.0 * value, color=figures.MUTED, linestyle="--", linewidth=1, label=name)
+    if bounds:  # outside, where it covers no point
+        figure.legend(loc="outside upper right", fontsize=8, frameon=False, labelcolor=figures.MUTED)
     axes.set(xlabel="seconds of the method, its warm start included", ylabel=f"{score} (%)", xlim=(0, None))
-    axes.margins(y=0.2)
+    axes.margins(x=0.06, y=0.2)
     axes.grid(color=figures.GRID)
     figures.style(axes)
     return render.data_uri(figure)
+
+
+def _apart(seconds: Sequence[float], least: float = 0.08) -> list[int]:
+    """Return the points whose labels do not meet: the last, and going back each that is far enough from the next."""
+    width, kept = least * (seconds[-1] or 1.0), [len(seconds) - 1]
+    for place in range(len(seconds) - 2, -1, -1):
+        if seconds[kept[-1]] - seconds[place] >= width:
+            kept.append(place)
+    return kept
 
 
 def _training(images: LabelledImages, results: RunResults) -> list[Picture]:
@@ -257,9 +277,3 @@ def _examples(shown: Shown, names: Sequence[str], score: Score) -> dict[str, lis
         title = f"{kind} ({len(rows)} of {len(test)})"
         found[title] = pictures.detected(test, chosen, shown.detections["learned"], names)
     return found
-
-
-def _files(folder: Path) -> list[str]:
-    """Return the files of the run that a reader may open next."""
-    wanted = ("results.json", "detections.json", "training_set/annotations.json", "model.json", "model.onnx")
-    return [name for name in wanted if (folder / name).exists()]

@@ -65,7 +65,7 @@ def listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1) -> str:
+def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1, images: str = "test images") -> str:
     """Say in one sentence whether the run worked.
 
     That it worked is said of several trainings alone. The interval of one is over test images, and trainings on
@@ -75,9 +75,10 @@ def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1) -> str:
         gain: None where no detector was scored.
         score: what the gain is of.
         trainings: of each distribution.
+        images: what they were scored on.
     """
     if gain is None:
-        return "The detectors were not scored on test images, so whether it worked is not known."
+        return f"The detectors were not scored on {images}, so whether it worked is not known."
     points, reach, who = PERCENT * gain.gain.value, bounds(gain.gain), listed(gain.names)
     change = f"{abs(points):.1f} {POINTS[score]}"
     reached = f"{PERCENT * gain.ap['ns']:.1f} to {PERCENT * gain.ap['learned']:.1f}"
@@ -85,17 +86,17 @@ def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1) -> str:
     if gain.outcome == "better":
         several = "It worked: training on the learned distribution gives"
         text = f"{several if trainings > 1 else one} {change} more on {who}"
-        over = reach if trainings > 1 else f"{reach} over test images"
+        over = reach if trainings > 1 else f"{reach} over {images}"
         return f"{text} ({over}), from {reached}{_of_the_room(gain)}."
     if gain.outcome == "worse":
         reach = bounds(gain.gain.negated)
         if trainings == 1:
-            return f"{one} {change} less on {who} ({reach} over test images)."
+            return f"{one} {change} less on {who} ({reach} over {images})."
         return (
             f"It made things worse: training on the learned distribution costs {change} on {who} ({reach})."
         )
     changes = f"changes the {score} of {who} by {points:+.1f}"
-    text = f"No difference can be told: the learned distribution {changes} ({reach})"
+    text = f"No difference can be told on {images}: the learned distribution {changes} ({reach})"
     return f"{text}{_of_the_room(gain)}."
 
 

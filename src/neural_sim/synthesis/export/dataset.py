@@ -18,7 +18,7 @@ from neural_sim.processes import processes
 from neural_sim.synthesis.export import bop
 from neural_sim.synthesis.export.coco import coco_document
 from neural_sim.synthesis.export.folder import ExportFolder, opencv_entry, record_of, write_json, write_whole
-from neural_sim.synthesis.export.images import ImageSource
+from neural_sim.synthesis.export.images import GOLDEN, ImageSource, spread
 from neural_sim.synthesis.export.yolo import write_yolo
 
 _log = logging.getLogger(__name__)
@@ -63,6 +63,7 @@ class DataSet:
 
     Existing images stay, with their ids; those numbered ``count`` or more stay in the set, too. ``identity`` is what
     all images depend on, see ``ExportFolder``; ``models`` are the objects as BOP describes them.
+    ``val_fraction`` of the images are for validation; an image stays in its part when the set grows.
     """
 
     source: ImageSource
@@ -75,6 +76,7 @@ class DataSet:
     scene_size: int = 1000
     farthest: float = 6553.5
     workers: int = 0
+    val_fraction: float = 0.0
 
     def write(self, shown: Callable[[Iterable[int]], Iterable[int]]) -> list[dict[str, Any]]:
         """Write all missing images, then the annotations; return the records of all. ``shown`` is a progress bar.
@@ -106,16 +108,30 @@ class DataSet:
             folder.finish(ordered)
         return ordered
 
+    def parts(self, records: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+        """Return the records for training and for validation; nothing where one of them would be empty."""
+        parts: dict[str, list[Mapping[str, Any]]] = {"train": [], "val": []}
+        for record in records:
+            held_out = spread(record["number"], self.val_fraction, GOLDEN)
+            parts["val" if held_out else "train"].append(record)
+        return parts if all(parts.values()) else {}
+
     def _annotate(self, records: Sequence[Mapping[str, Any]], scale: float) -> None:
-        names = self.source.scene.names
+        names, parts = self.source.scene.names, self.parts(records)
+        if self.val_fraction and not parts:
+            _log.warning("export: %d images are too few to part them: no split is made", len(records))
+        for name in ("train", "val"):  # of an earlier export with another split
+            (self.root / f"annotations_{name}.json").unlink(missing_ok=True)
         if "coco" in self.formats:
             varies = any(
                 factor.coordinate == "magnification" for factor in self.source.scene.distribution.binned
             )
             camera = None if varies else opencv_entry(self.source.camera)
-            write_json(self.root / "annotations.json", coco_document(records, names, camera))
+            documents = {"annotations": records} | {f"annotations_{name}": own for name, own in parts.items()}
+            for name, own in documents.items():
+                write_json(self.root / f"{name}.json", coco_document(own, names, camera))
         if "yolo" in self.formats:
-            write_yolo(self.root, records, names)
+            write_yolo(self.root, records, names, parts)
         if "bop" in self.formats:
             bop.write_bop(self.root, records, self.models, self.scene_size, scale)
 

@@ -21,6 +21,8 @@ from neural_sim.types import PinholeCamera, SceneDraw
 
 MASK_OPACITY = 0.5
 """Opacity above which a pixel belongs to an object: at it a ray has lost half of its light, where the depth is."""
+GOLDEN, SILVER = 0.5 * (math.sqrt(5.0) - 1.0), math.sqrt(2.0) - 1.0
+"""Steps that spread numbers evenly, however many there are, and independently of each other."""
 
 Box = tuple[int, int, int, int]
 
@@ -72,6 +74,11 @@ class ExportImage:
     objects: tuple[ShownObject, ...]
 
 
+def spread(number: int, fraction: float, step: float) -> bool:
+    """Return whether a number is one of a fraction of all, which are evenly spread over any run of numbers."""
+    return (number + 1) * step % 1.0 < fraction
+
+
 @dataclass(frozen=True)
 class ImageSource:
     """Images by number. An image depends only on ``seed`` and its number, so that a set can grow.
@@ -79,6 +86,7 @@ class ImageSource:
     ``scene`` says how images are made; they are drawn from ``psi`` [objects, K]; ``camera`` has their size.
     ``millimetres`` is each object's radius. Image i has the class i modulo their number as its own. The synthesizer's
     shift turns the camera (``cameras.turned``), so that every object has an exact pose under the image's one camera.
+    A fraction ``empty`` of the images shows no object.
     """
 
     scene: Scene
@@ -86,6 +94,7 @@ class ImageSource:
     camera: PinholeCamera
     millimetres: tuple[float, ...]
     seed: int
+    empty: float = 0.0
 
     def generator(self, number: int, part: Literal["scene", "pixels"]) -> torch.Generator:
         """Return the generator of an image's scene parameters, or of its background and noise."""
@@ -94,6 +103,8 @@ class ImageSource:
 
     def drawn(self, number: int) -> list[DrawnObject]:
         """Draw the objects of an image, its own object first."""
+        if spread(number, self.empty, SILVER):
+            return []
         generator, scene, camera = self.generator(number, "scene"), self.scene, self.camera
         synthesizer, classes = scene.synthesizer, len(scene.names)
         layout = draw_layout(torch.tensor([number % classes]), classes, synthesizer.count, generator)

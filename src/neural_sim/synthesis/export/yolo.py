@@ -18,11 +18,22 @@ DATA = "dataset.yaml"
 SEGMENT = "segment"
 
 
-def write_yolo(folder: Path, records: Sequence[Mapping[str, Any]], class_names: Sequence[str]) -> None:
-    """Write ``dataset.yaml`` and ``labels/*.txt`` (boxes) for ``folder/images``.
+def write_yolo(
+    folder: Path,
+    records: Sequence[Mapping[str, Any]],
+    class_names: Sequence[str],
+    parts: Mapping[str, Sequence[Mapping[str, Any]]],
+) -> None:
+    """Write ``dataset.yaml``, its lists of images, and ``labels/*.txt`` (boxes) for ``folder/images``.
 
     ``segment`` has the same images, with the visible masks as polygons. Images without objects have empty files, as
     YOLO expects.
+
+    Args:
+        folder: of the data set.
+        records: of all images.
+        class_names: by label.
+        parts: those of ``train`` and ``val``; without any, both are all images, and the file says so.
     """
     for record in records:
         name = Path(record["file"])
@@ -34,8 +45,13 @@ def write_yolo(folder: Path, records: Sequence[Mapping[str, Any]], class_names: 
         same_file(folder / name, folder / SEGMENT / "images" / name.name)
     names = "".join(f"  {label}: {json.dumps(name)}\n" for label, name in enumerate(class_names))
     # Without a root in the file, readers take paths to be relative to the file.
-    text = f"train: images\nval: images # no split is made; name your own\nnc: {len(class_names)}\nnames:\n{names}"
+    heads = [f"{part}: {part}.txt\n" for part in parts] or [
+        "train: images\nval: images # no split is made; name your own\n"
+    ]
+    text = f"{''.join(heads)}nc: {len(class_names)}\nnames:\n{names}"
     for place in (folder, folder / SEGMENT):
+        for part, own in parts.items():
+            write_whole(place / f"{part}.txt", "".join(f"./{record['file']}\n" for record in own))
         write_whole(place / DATA, text)
 
 

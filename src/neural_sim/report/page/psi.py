@@ -1,0 +1,145 @@
+"""What was learned: psi over the iterations, and every bin with its picture, its share of images and its score."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from jaxtyping import UInt8
+from matplotlib.colors import to_hex
+from torch import Tensor
+
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.report import figures
+from neural_sim.report.figures import Figure, Thumbnails
+from neural_sim.report.page import render
+from neural_sim.report.page.pictures import picture
+from neural_sim.report.page.weak_bins import BinScore
+from neural_sim.report.run import Learned, RunResults
+
+NEAR = 0.02
+"""Total variation that is no move."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A bin of an object.
+
+    Args:
+        number: from 1.
+        source: of its picture; None: there is none.
+        colour: in the charts.
+        shares: fractions of the object's training images from this bin: ``initial``, ``learned`` and perhaps
+            ``target``.
+        same: other bins that look the same.
+        score: on the test images from this bin; None: there are too few, or bins of this factor are not known.
+    """
+
+    number: int
+    source: str | None
+    colour: str
+    shares: Mapping[str, float]
+    same: tuple[int, ...] = ()
+    score: BinScore | None = None
+
+
+@dataclass(frozen=True)
+class ObjectPsi:
+    """One object's distribution of a factor.
+
+    Args:
+        name: of the object.
+        chart: of its probabilities over the iterations.
+        comment: on how it moved, see ``comment``.
+        distances: from the target; empty: not known.
+        tiles: its bins; none of lights.
+    """
+
+    name: str
+    chart: str
+    comment: str
+    distances: Mapping[str, float]
+    tiles: tuple[Tile, ...]
+
+
+def learned_psi(
+    results: RunResults, bins: Thumbnails, scores: Sequence[BinScore]
+) -> dict[str, list[ObjectPsi]]:
+    """Return what was learned by factor, of the biased objects first; nothing where nothing was."""
+    found: dict[str, list[ObjectPsi]] = {}
+    for factor in results.factors if results.moved else ():
+        for one in sorted(results.of_factor(factor), key=lambda one: one.name not in results.biased):
+            tiles = _tiles(one, bins.get(one.name, {}), scores)
+            said = comment(one, results.records)
+            found.setdefault(factor, []).append(
+                ObjectPsi(one.name, psi_chart(one), said, one.distances, tiles)
+            )
+    return found
+
+
+def _tiles(
+    one: Learned, own: Mapping[str, UInt8[Tensor, "bins h w 3"]], scores: Sequence[BinScore]
+) -> tuple[Tile, ...]:
+    if own and one.factor not in own:  # lights
+        return ()
+    # Bins of test images are those of the first factor that has bins.
+    scored = {s.bin: s for s in scores if s.name == one.name and one.factor == next(iter(own), one.factor)}
+    colours = bin_colours(one.factor, len(one.p["learned"]))
+    group_of = {number: group for group in one.groups for number in group}
+    return tuple(
+        Tile(
+            number,
+            picture(own[one.factor][number - 1]) if own else None,
+            colour,
+            {which: p[number - 1] for which, p in one.p.items()},
+            tuple(other for other in group_of[number] if other != number),
+            scored.get(number),
+        )
+        for number, colour in enumerate(colours, 1)
+    )
+
+
+def comment(one: Learned, records: Sequence[Mapping[str, Any]]) -> str:
+    """Say what a chart does not: why psi did not move, that it fell back, or that it left the target."""
+    backs = [record["taken_back"][one.name] for record in records if one.name in record["taken_back"]]
+    if backs:
+        kept, accepted = backs[-1]["kept"], backs[-1]["accepted"]
+        where = f"to where it was after {kept} of {accepted} accepted steps" if kept else "to its start"
+        return f"At the end it went back {where}: later trainings did not bear out the others."
+    start, end = one.p["initial"], one.p["learned"]
+    if 0.5 * sum(abs(a - b) for a, b in zip(start, end, strict=True)) < NEAR:
+        return _why_it_stayed(one, records)
+    if one.distances and one.distances["learned"] > one.distances["initial"] + NEAR:
+        return "It moved away from the target."
+    return ""
+
+
+def _why_it_stayed(one: Learned, records: Sequence[Mapping[str, Any]]) -> str:
+    certificates = [record["certificate"] for record in records if record["certificate"]]
+    actions = {c["actions"].get(one.name, {}).get(one.factor) for c in certificates} - {None}
+    verdicts = [record["verdicts"][one.name] for record in records if one.name in record["verdicts"]]
+    if verdicts and not any(verdict["accepted"] for verdict in verdicts):
+        return "It did not move: trainings rejected its steps."
+    if actions == {"skipped"}:
+        return "It did not move: its derivative was never told from zero."
+    return "It did not move."
+
+
+def bin_colours(factor: str, bins: int) -> list[str]:
+    """Return the colours of a factor's bins in these charts."""
+    return [to_hex(colour) for colour in figures.bin_colours(factor, bins)]
+
+
+def psi_chart(learned: Learned) -> str:
+    """Draw one object's probabilities over the iterations, with the target's next to them."""
+    figure = Figure(figsize=(3.4, 2.1), layout="constrained")
+    figures.psi_panel(figure.add_subplot(), learned)
+    return render.data_uri(figure)
+
+
+def shown_chart(one: FactorEstimate) -> str:
+    """Draw what the target shows of one object and factor, with psi's bars next to it."""
+    figure = Figure(figsize=(3.4, 1.9), layout="constrained")
+    figures.shown_panel(figure.add_subplot(), one)
+    return render.data_uri(figure)

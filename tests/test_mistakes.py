@@ -1,0 +1,54 @@
+"""Typical mistakes of a beginner: each is one line that says what to type instead, and leaves nothing behind."""
+
+import logging
+import sys
+
+import pytest
+
+from neural_sim import main as program
+
+MISTAKES = [  # what is typed, where {here} is an empty folder, and what the line must say
+    ("dmeo", "dmeo: no such command or experiment; did you mean demo?"),
+    ("pose_gap", "pose_gap: want +experiment=pose_gap"),
+    ("+experiment=pose_gab", "did you mean experiment=pose_gap"),
+    ("experiment=pose_gap", "want +experiment=pose_gap, because it has no default"),
+    ("detecter=fcos", "detecter: unknown key; did you mean detector"),
+    ("detector=yolo", "detector=yolo: no such choice; want one of classifier, "),
+    ("scale=big", "want one of paper, quick, smoke"),
+    ("seed 1", "seed: want key=value, such as seed=1"),
+    ("-m seed=0 1 2", "1: want key=value; values of a sweep are joined by commas, such as -m seed=0,1,2"),
+    ("iterations=3", "did you mean outer.iterations"),
+    ("stages=[train]", "no stage train; want some of views, field, target_sets, warm_start, psi, evaluate, report, "),
+    ("stages=[fields,psi]", "no stage fields; did you mean field?"),
+    ("stages=[export", "check its brackets and quotes"),
+    ("baseline=random_search", "is gone: want baseline=lts"),
+    ("objects=photos objects.root={here}/mugs", "mugs does not exist; want a folder that holds a folder for"),
+    ("objects.root={here}", "want objects=bop or objects=co3d or objects=folder or objects=photos or objects=ycb"),
+    ("target=coco target.annotations={here}/val.json", "val.json does not exist; want a COCO file of labelled"),
+    ("predict predict.model={here}/run", "run does not exist; want a run's folder, such as outputs/runs/"),
+    ("predict predict.images={here}/photos", "photos does not exist; want a picture, a folder or a pattern"),
+    ("seed=one", "seed: want a whole number, got 'one'"),
+    ("objects=photos", "objects.root is not given: want a folder that holds a folder for each object, "),
+    ("outer.iterations=0", "outer.iterations: want at least 1, got 0"),
+    ("export export.width=640", "export: want width and height or neither, got 640 and None"),
+    ("predict", "predict.images: want a folder of pictures, a glob or a picture, got null"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("typed", "said"), MISTAKES)
+def test_a_mistake_is_one_line_that_says_what_to_type(typed, said, tmp_path, monkeypatch, capsys):
+    """In this process, so that it is soon told; test_commandline.py has what a new one takes."""
+    monkeypatch.setattr(logging, "raiseExceptions", True)  # which the program sets
+    here = tmp_path / "empty"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    words = [word.format(here=here) for word in typed.split()]
+    places = [f"paths.store={here}/store", f"paths.mlflow={here}/mlflow.db", "hydra/job_logging=none"]
+    monkeypatch.setattr(sys, "argv", ["neural-sim", *words, *places])
+    with pytest.raises(SystemExit) as ended:
+        program.main()
+    told = capsys.readouterr()
+    assert ended.value.code == 2 and told.out == ""
+    assert told.err.startswith("neural-sim: ") and told.err.count("\n") == 1 and said in told.err
+    results = [path for path in here.rglob("*") if path.is_file() and ".hydra" not in path.parts]
+    assert not results
