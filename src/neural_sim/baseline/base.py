@@ -27,18 +27,18 @@ class Search(Protocol):
         ...
 
     def tell(self, reward: float, by_object: Float[Tensor, "objects"]) -> None:
-        """Tell the reward of a detector trained on images of the psi last asked for; larger is better.
+        """Record the reward of a detector trained on images at the psi last asked for; larger is better.
 
-        ``by_object`` is what it scored on each object's class, 0 of classes that validation images do not show.
+        ``by_object`` is its score on each object's class, 0 for classes that validation images do not show.
         """
         ...
 
     def state(self) -> dict[str, Any]:
-        """Return what it has learned, without its generator, so that a run that is killed can be taken up."""
+        """Return what it has learned, without its generator, so that an interrupted run can resume."""
         ...
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a ``state``, just after ``begin``."""
+        """Continue from a ``state``, directly after ``begin``."""
         ...
 
 
@@ -75,9 +75,9 @@ class HypergradientLoop:
 @validated
 @dataclass(frozen=True)
 class Response:
-    """Steps of psi by the measured response of training, without a derivative (``outer.response``).
+    """Steps of psi by the finite-difference response of training, without a derivative (``outer.response``).
 
-    It takes a training for each bin, in which ``part`` of every object's images moves to it.
+    It takes one training for each bin, in which ``part`` of every object's images moves to that bin.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """Learning to Simulate (Ruiz, Schulter and Chandraker 2019): REINFORCE on the rewards of simulator settings.
 
 The policy is a Gaussian over psi with a learned mean omega and fixed deviations. A setting drawn from it makes one data
-set, on which one detector is trained; what that scores on the target set is the setting's reward. After every
-``samples`` of them omega steps along ``mean_k (R_k - b) d log pi(psi_k) / d omega`` (their Algorithm 1).
+set, on which one detector is trained; its score on the target set is the setting's reward. After every ``samples``
+settings, omega steps along ``mean_k (R_k - b) d log pi(psi_k) / d omega`` (their Algorithm 1).
 """
 
 from __future__ import annotations
@@ -27,23 +27,24 @@ from neural_sim.ranges import Positive, PositiveInt, validated
 class LearningToSimulate:
     """A Gaussian policy over psi, whose mean steps along the policy gradient times the policy's variance.
 
-    Rewards count in their own running standard deviations, so that steps depend neither on their unit nor on an offset.
+    Rewards are divided by their running standard deviation, so that steps depend neither on their unit nor on an
+    offset.
 
     Args:
-        name: in reports.
-        learning_rate: deviations that omega moves at a mean advantage of one.
-        deviation: the policy's, in logits of bins.
-        light_deviation: the policy's, in weights of lights.
-        samples: K, settings between two steps.
-        rewarded: what an object's part of psi is rewarded by: the ``whole`` data set's score, or by ``object`` that of
-            its own class.
-        baseline: b: a ``moving_average`` of earlier rewards (the first settings, which have none, take their own mean),
+        name: name in reports.
+        learning_rate: number of deviations that omega moves at a mean advantage of one.
+        deviation: the policy's deviation, in logits of bins.
+        light_deviation: the policy's deviation, in weights of lights.
+        samples: K, the number of settings between two steps.
+        rewarded: the reward of an object's part of psi: the ``whole`` data set's score, or with ``object`` that of its
+            own class.
+        baseline: b: a ``moving_average`` of earlier rewards (the first settings, which have none, use their own mean),
             or the mean of the step's other settings (``leave_one_out``).
-        decay: of the moving averages of rewards and of squared advantages.
+        decay: decay of the moving averages of rewards and of squared advantages.
         rounds: settings for each outer iteration of the budget; two take about as long as one hypergradient.
 
     Raises:
-        ValueError: ``leave_one_out`` of a single setting.
+        ValueError: ``leave_one_out`` with a single setting.
     """
 
     name: str = "lts"
@@ -63,7 +64,7 @@ class LearningToSimulate:
     def begin(
         self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
     ) -> Policy:
-        """Make a policy whose mean is ``psi``."""
+        """Make a policy with the mean ``psi``."""
         return Policy(self, distribution, psi.detach().clone(), generator)
 
 
@@ -109,7 +110,7 @@ class Policy(Search):
     def ask(self) -> Float[Tensor, "objects K"]:
         noise = torch.randn(self._omega.shape, generator=self._generator, dtype=torch.float64).to(self._omega)
         self._noise.append(noise)
-        # The density is that of the draw before its projection: the projected one has none.
+        # The density is that of the draw before its projection: the projected draw has none.
         return self._distribution.constrained(self._omega + self._deviation * noise)
 
     @override
@@ -121,13 +122,13 @@ class Policy(Search):
             return
         advantages, noise = self._advantages(torch.stack(self._rewards)), torch.stack(self._noise)
         self._noise, self._rewards = [], []
-        # d log pi / d omega is noise / deviation; times the variance, so that a step is in deviations.
+        # d log pi / d omega is noise / deviation; it is multiplied by the variance, so that a step is in deviations.
         score = (advantages[..., None] * noise).mean(0)
         step = self._settings.learning_rate * self._deviation * score
         self._omega = self._distribution.constrained(self._omega + self._centred(step))
 
     def _advantages(self, rewards: Float[Tensor, "samples objects"]) -> Float[Tensor, "samples objects"]:
-        """Compute ``R - b`` over the root of its moving mean square, then update b."""
+        """Compute ``R - b`` divided by the root of its moving mean square, then update b."""
         mean, decay = rewards.mean(0), self._settings.decay
         before = mean if self._mean is None else self._mean
         above = rewards - before
@@ -139,6 +140,6 @@ class Policy(Search):
         return torch.where(self._variance > 0.0, above / self._variance.sqrt(), 0.0)
 
     def _centred(self, step: Float[Tensor, "objects K"]) -> Float[Tensor, "objects K"]:
-        """Take each factor's mean off: p does not depend on it, and weights add up to 1."""
+        """Subtract each factor's mean: p does not depend on it, and weights add up to 1."""
         parts = self._distribution.split(step)
         return self._distribution.join({n: part - part.mean(-1, keepdim=True) for n, part in parts.items()})

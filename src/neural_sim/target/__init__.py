@@ -1,1 +1,1 @@
-"""Labelled target sets: what the detector shall be good at."""
+"""Labelled target sets: where the detector will be used."""

@@ -1,4 +1,4 @@
-"""What a run asks of its target, and what all targets of photographs share."""
+"""What a run needs from its target, and what all targets of photographs share."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from neural_sim.types import LabelledImages, PinholeCamera
 
 
 class Target(ABC):
-    """Labelled images in parts: ``val``, which psi is learned on, ``test``, which is scored once, and ``train``.
+    """Labelled images in parts: the validation set ``val``, on which psi is learned; ``test``, scored once; ``train``.
 
-    A subclass keeps its constructor's arguments as attributes of the same names, as a frozen dataclass does: they are
-    the YAML keys of ``target``, and the store's keys are made of them. Bad settings and missing files are refused in
+    A subclass stores its constructor's arguments as attributes of the same names, as a frozen dataclass does: they are
+    the YAML keys of ``target``, and the store's keys are made from them. Bad settings and missing files are refused in
     the constructor, before anything is computed.
 
     Attributes:
         renders: True if the images are rendered from the run's objects at the distribution that ``parameter.*.target``
-            states. False for photographs: nobody knows their distribution unless it is stated.
-        boxed: False if images have no boxes, only classes; such a target wants ``task=classification``.
+            states. False for photographs, whose distribution is unknown unless it is stated.
+        boxed: False if images have no boxes, only classes; such a target needs ``task=classification``.
     """
 
     renders: ClassVar[bool]
@@ -45,7 +45,7 @@ class Target(ABC):
     @property
     @abstractmethod
     def trains(self) -> bool:
-        """Whether there is a part ``train``, which ``training.real`` trains detectors on."""
+        """Whether there is a part ``train``, on which ``training.real`` trains detectors."""
 
     @abstractmethod
     def sets(
@@ -60,16 +60,16 @@ class Target(ABC):
 
         Args:
             objects: the run's objects by name; labels are positions in it.
-            distribution: the scene parameters; bins of boxes are those of its first factor with bins.
-            camera: says the size of the images; a target that renders takes all of it.
-            synthesizer: composes rendered views with backgrounds, as it does for training images.
-            seed: of all random choices.
+            distribution: the scene parameters; the bins of boxes are those of its first factor with bins.
+            camera: gives the size of the images; a target that renders uses all of it.
+            synthesizer: composes rendered views with backgrounds, as for training images.
+            seed: seed of all random choices.
 
         Returns:
             ``val``, ``test`` and, if the target ``trains``, ``train``; float32 on the CPU. They share no image.
 
         Raises:
-            ValueError: files that cannot be used, or classes that are no objects.
+            ValueError: files cannot be used, or classes are not objects.
         """
 
     def training_count(self, seed: int) -> int | None:
@@ -80,7 +80,7 @@ class Target(ABC):
         """Return the camera that took the images, in its own size.
 
         Raises:
-            ValueError: no camera is known.
+            ValueError: the camera is unknown.
         """
         raise ValueError(
             "camera=from_target wants a target with a camera of its own (target=ycb_video, bop, or coco with an "
@@ -88,7 +88,7 @@ class Target(ABC):
         )
 
     def digest(self) -> str | None:
-        """Return the SHA-256 of the files that the images are made from, for the store's keys; None without files."""
+        """Return the SHA-256 of the files from which the images are made, for the store's keys; None without files."""
         return None
 
 
@@ -97,16 +97,16 @@ class Photographs(Target):
     """Labelled photographs, letterboxed to the size of the run's images.
 
     Args:
-        val_fraction: fraction of the photographs for validation, which psi is learned on, as near to it as whole groups
-            come; the rest is scored. Void where the data set has parts of its own.
-        train_fraction: of the photographs that are not scored, the fraction for training (``training.real``), whole
-            groups too; the others are for validation. None: all of them are.
-        split_by: what belongs together and so lies in one part, as frames of one video must, see
-            ``neural_sim.target.split.groups_of``; None: what the data set says, else every photograph is a group of
-            its own, and near-duplicates in two parts are warned of.
-        limit: at most this number of photographs; subclasses say of what, and which; None: all.
-        unmatched: what becomes of a class of the data set that is no object: ``refuse`` the data set, or ``leave_out``
-            the class.
+        val_fraction: fraction of the photographs in the validation set, on which psi is learned, as near as whole
+            groups allow; the rest is scored. Has no effect if the data set has its own parts.
+        train_fraction: fraction, of the photographs that are not scored, for training (``training.real``), also in
+            whole groups; the others are for validation. None: all are for validation.
+        split_by: what belongs together and must lie in one part, such as frames of one video, see
+            ``neural_sim.target.split.groups_of``; None: what the data set says, or else every photograph is its own
+            group, with a warning about near-duplicates in two parts.
+        limit: largest number of photographs; subclasses say of what, and which are taken; None: all.
+        unmatched: what to do with a class of the data set that is not an object: ``refuse`` the data set, or
+            ``leave_out`` the class.
         minimum_side: boxes with a side shorter than this many pixels of the run's images are dropped and counted.
     """
 
@@ -120,7 +120,7 @@ class Photographs(Target):
 
     @property
     def split(self) -> Split:
-        """How the photographs are parted."""
+        """How the photographs are divided into parts."""
         return Split(self.val_fraction, self.train_fraction, self.split_by)
 
     @property
@@ -130,7 +130,7 @@ class Photographs(Target):
 
     @abstractmethod
     def files(self) -> Mapping[str, Path]:
-        """Return the files that the images are made from, by names that do not depend on where they lie."""
+        """Return the files from which the images are made, by names that do not depend on their location."""
 
     @cached_property
     def _contents(self) -> str:
@@ -143,7 +143,7 @@ class Photographs(Target):
 
 @dataclass(frozen=True, kw_only=True)
 class AnnotatedPhotographs(Photographs):
-    """Photographs with labels of their own, parted by groups and by their pixels: equal ones lie in one part.
+    """Photographs with labels of their own, divided by groups and by their pixels: equal ones lie in one part.
 
     A subclass says what there is to read: ``source``, ``files`` and ``photographs``. For the arguments see
     ``Photographs``.
@@ -162,18 +162,18 @@ class AnnotatedPhotographs(Photographs):
 
         Args:
             objects: the run's objects in the order of their labels.
-            distribution: the scene parameters, for bins that must be bins of its first factor that has any; None: they
-                may be any.
+            distribution: the scene parameters; bins must be bins of its first factor that has any. None: they may be
+                any.
 
         Raises:
-            ValueError: labels that cannot be used, or classes that are no objects.
+            ValueError: labels cannot be used, or classes are not objects.
         """
 
     def load(self, objects: Sequence[str], height: int, width: int) -> LabelledImages:
         """Read all photographs; labels are positions in ``objects``.
 
         Raises:
-            ValueError: as of ``photographs``, or a file that cannot be read.
+            ValueError: as for ``photographs``, or a file cannot be read.
         """
         return read(self.photographs(objects), height, width, self.minimum_side, self.source)[0]
 
@@ -205,5 +205,5 @@ class AnnotatedPhotographs(Photographs):
         distribution: SceneDistribution,
         generator: torch.Generator,
     ) -> Mapping[str, Int[Tensor, "_"]]:
-        """Choose some of each part's ``rows``; all of them, unless a subclass does otherwise."""
+        """Choose some of each part's ``rows``; by default, all of them."""
         return rows

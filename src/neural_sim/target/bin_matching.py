@@ -1,4 +1,4 @@
-"""Photographs chosen so that each object is seen in pose bins as often as a distribution says."""
+"""Choice of photographs such that each object is seen in pose bins as often as a distribution says."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def matching(
     generator: torch.Generator,
     where: str,
 ) -> Int[Tensor, "chosen"]:
-    """Choose those of ``rows`` that follow ``targets``, the distributions over bins by object in label order.
+    """Choose from ``rows`` photographs that follow ``targets``, the distributions over bins by object in label order.
 
-    Of every object as many photographs are chosen as there are for its distribution, each at most once and at random
-    within a bin. The number in a bin is the distribution's, rounded up or down. Photographs without a box that has a
-    bin are left out, and objects without photographs too.
+    For every object, as many photographs are chosen as its distribution allows, each at most once and at random within
+    a bin. The number in a bin is that of the distribution, rounded up or down. Photographs without a box that has a bin
+    are left out, and so are objects without photographs.
 
     Raises:
-        ValueError: a photograph of several objects or bins, or none of a bin that the distribution needs; begins with
-            ``where``.
+        ValueError: a photograph shows several objects or bins, or none shows a bin that the distribution needs; the
+            message begins with ``where``.
     """
     cells = _rows_by_cell(images, rows, where)
     chosen: list[int] = []
@@ -73,7 +73,7 @@ def _bins(images: LabelledImages, row: int) -> list[int]:
 
 
 def most(p: Sequence[float], available: Sequence[int], generator: torch.Generator) -> list[int] | None:
-    """Return the largest ``apportioned`` number of photographs that is available; None where not even one is."""
+    """Return the largest available ``apportioned`` choice of photographs; None if there is none."""
     for total in range(sum(available), 0, -1):
         counts = apportioned(p, total, available, generator)
         if counts is not None:
@@ -86,10 +86,10 @@ def apportioned(
 ) -> list[int] | None:
     """Split ``total`` photographs among bins by largest remainders, each ``total * p`` rounded up or down.
 
-    Of bins with equal remainders those that have enough are rounded up, at random.
+    Of bins with equal remainders, those with enough photographs are rounded up, at random.
 
     Returns:
-        The number of each bin; None where a bin has too few photographs.
+        The number in each bin; None if a bin has too few photographs.
     """
     quotas = [total * value for value in p]
     counts = [math.floor(quota + 1e-9) for quota in quotas]

@@ -47,9 +47,9 @@ class BopTarget(PosedTarget):
     """Photographs of a BOP data set. Classes are ``obj_000001`` and so on.
 
     Args:
-        val: the folder of scenes for validation, one in ``every`` photographs of each, such as ``train_real``; None:
+        val: folder of the validation scenes, with one in ``every`` photographs of each, such as ``train_real``; None:
             scenes of ``test``.
-        test: the folder of scenes that are scored: the images of ``test_targets_bop19.json`` where present and the
+        test: folder of the scenes that are scored: the images in ``test_targets_bop19.json`` if it is present and the
             folder is ``test``, else one in ``every`` photographs of each scene.
 
     See ``PosedTarget`` for the other arguments.
@@ -97,7 +97,7 @@ def _targets(path: Path) -> list[FrameName]:
 class BopScenes(FrameReader):
     """The files of a BOP data set.
 
-    An object's centre is that of its box in ``models/models_info.json``, its poses' origin where there is none; its
+    An object's centre is that of its box in ``models/models_info.json``, or the origin of its poses without one; its
     visibility is ``visib_fract``.
     """
 
@@ -158,7 +158,7 @@ class BopScenes(FrameReader):
         if mask is not None:
             box = box_of_mask(mask)
         else:
-            # The toolkit's width and height are differences of first and last pixels.
+            # The toolkit's width and height are differences between last and first pixels.
             x, y, width, height = numbers(info["bbox_visib"], 4, f"{where}: bbox_visib").tolist()
             box = (x, y, x + width + 1, y + height + 1) if width >= 0 and height >= 0 else None
         said = where.replace("scene_gt.json", "scene_gt_info.json")
@@ -232,7 +232,7 @@ class BopScenes(FrameReader):
         return self._file(name, IMAGES)
 
     def _file(self, name: FrameName, forms: Sequence[str]) -> Path:
-        """Return the first of a photograph's possible files that is there, else the first."""
+        """Return the first of a photograph's possible files that exists, else the first."""
         files = [self._folder(name) / form.replace("*", f"{name.number:06d}") for form in forms]
         return next((file for file in files if file.is_file()), files[0])
 
@@ -258,7 +258,7 @@ def _want(entry: Any, keys: Sequence[str], where: str) -> None:
 
 
 def _mapping(path: Path) -> dict[str, Any]:
-    """Read a JSON file of entries by number. Raises ``ValueError`` for another."""
+    """Read a JSON file of entries by number. Raises ``ValueError`` for any other file."""
     data = read_json(path)
     if not isinstance(data, dict) or not all(key.isdigit() for key in data):
         raise ValueError(f"{path}: want entries by number")

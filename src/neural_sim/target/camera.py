@@ -1,4 +1,4 @@
-"""The camera of synthesised and of rendered target images: given, or that of the target's photographs."""
+"""The camera of synthesised and rendered target images: a given one, or that of the target's photographs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neural_sim.types import PinholeCamera
 
 
 class CameraSource(Protocol):
-    """What a configured camera is made from."""
+    """The configuration of a camera."""
 
     def camera(self, image_size: int, field_of_view_deg: float, target: Target) -> PinholeCamera:
         """Return the camera.
@@ -35,16 +35,16 @@ class GivenCamera(CameraSource):
     """A camera by its field of view or by its OpenCV camera matrix.
 
     Args:
-        width, height: in pixels; null, both of them: those of a square image of the training's size.
-        field_of_view_deg: the vertical one, for square pixels and a principal point in the image's centre; null, where
-            no focal length is given: that of the objects' views.
+        width, height: size in pixels; null, both: a square image of the training's size.
+        field_of_view_deg: vertical field of view, for square pixels and a principal point in the image's centre; null,
+            without a focal length: that of the objects' views.
         fx, fy: focal lengths in pixels; ``fy`` null: square pixels.
-        cx, cy: the principal point in pixels from the centre of the upper left pixel, as OpenCV counts; null: the
+        cx, cy: principal point in pixels from the centre of the upper left pixel, as in OpenCV; null: the
             image's centre, (width - 1) / 2 and (height - 1) / 2.
 
     Raises:
-        ValueError: one of width and height alone, a focal length beside a field of view, ``fy``, ``cx`` or ``cy``
-            without ``fx``, a number out of its range.
+        ValueError: only one of width and height is given; a focal length and a field of view; ``fy``, ``cx`` or ``cy``
+            without ``fx``; or a number out of its range.
     """
 
     width: PositiveInt | None = None
@@ -82,10 +82,10 @@ class TargetCamera(CameraSource):
     """The camera that took the target's photographs, with images scaled to the detector's size.
 
     Args:
-        width: of the detector's images, in pixels, with the height in proportion; null: the photographs' own.
+        width: width of the detector's images in pixels, with the height in proportion; null: the photographs' own.
 
     Raises:
-        ValueError: a width below 1; from ``camera``, a target that knows no camera.
+        ValueError: the width is below 1; from ``camera``: the target has no known camera.
     """
 
     width: PositiveInt | None = None
@@ -102,8 +102,8 @@ def camera_of_entry(entry: Any, where: str) -> PinholeCamera:
     """Return the camera of a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` (OpenCV, pixels).
 
     Raises:
-        ValueError: a key that is missing, unknown (photographs with distortion have to be undistorted first) or no
-            number; ``where`` says whose it is.
+        ValueError: a key is missing, unknown (photographs with distortion must be undistorted first) or not a
+            number; the message has ``where``.
     """
     keys = ("width", "height", "fx", "fy", "cx", "cy")
     got = entry if isinstance(entry, dict) else {}

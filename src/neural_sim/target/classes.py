@@ -1,4 +1,4 @@
-"""The classes of a data set, and the objects of the run that they are."""
+"""The classes of a data set, and which objects of the run they are."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ Unmatched = Literal["refuse", "leave_out"]
 
 @dataclass(frozen=True)
 class ClassMap:
-    """Which object a class of a data set is.
+    """Maps the classes of a data set to objects.
 
     Args:
-        mapping: class -> object, None to leave a class out. Classes not listed stand for themselves; None: none is.
+        mapping: class -> object, None to leave a class out. Classes not listed have the names of their objects; None:
+            none is listed.
         source: the data set, for messages.
-        key: the setting that has the mapping, for messages.
-        kind: what the data set calls a class, and several, for messages.
-        unmatched: what becomes of a class that is no object: ``refuse`` the data set, or ``leave_out`` the class; None:
-            refuse it, and there is no setting to choose.
+        key: the setting that holds the mapping, for messages.
+        kind: what the data set calls a class, and several classes, for messages.
+        unmatched: what to do with a class that is not an object: ``refuse`` the data set, or ``leave_out`` the class;
+            None: refuse, and there is no setting to choose otherwise.
     """
 
     mapping: Mapping[str, str | None] | None
@@ -32,7 +33,7 @@ class ClassMap:
     unmatched: Unmatched | None = "refuse"
 
     def check_listed(self, names: Collection[str]) -> None:
-        """Raise ``ValueError`` for a class of the mapping that is none of ``names``."""
+        """Raise ``ValueError`` for a class of the mapping that is not among ``names``."""
         strange = sorted(set(self._named) - set(names))
         if strange:
             raise ValueError(
@@ -40,18 +41,18 @@ class ClassMap:
             )
 
     def object_of(self, name: str) -> str | None:
-        """Return the name of the object that a class is, None for a class that is left out."""
+        """Return the name of a class's object; None for a class that is left out."""
         return self._named.get(name, name)
 
     @property
     def _named(self) -> dict[str, str | None]:
-        """The mapping as text: what the command line took for numbers (``{0: mug}``) are names, too."""
+        """The mapping as text: numbers that the command line parsed (``{0: mug}``) are names, too."""
         return {str(key): None if name is None else str(name) for key, name in (self.mapping or {}).items()}
 
     def labels(self, names: Collection[str], objects: Sequence[str]) -> dict[str, int | None]:
-        """Return the labels of classes, positions in ``objects``, None for those that the mapping leaves out.
+        """Return the labels of classes, positions in ``objects``; None for those that the mapping leaves out.
 
-        Classes that are no objects are missing. Objects without a class are warned of.
+        Classes that are not objects are missing. Objects without a class give a warning.
         """
         named = {name: self.object_of(name) for name in names}
         for lacking in sorted(set(objects) - set(named.values())):
@@ -62,7 +63,7 @@ class ClassMap:
         }  # fmt: skip
 
     def refuse(self, names: Collection[str], objects: Sequence[str]) -> None:
-        """Raise ``ValueError`` for classes that are no objects, if there are any and they are not to be left out."""
+        """Raise ``ValueError`` for classes that are not objects, unless these may be left out."""
         named = {name: self.object_of(name) for name in names}
         strange = sorted(
             name if name == found else f"{name} (as {found})"

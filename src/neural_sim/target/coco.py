@@ -1,4 +1,4 @@
-"""A user's own target set in COCO form."""
+"""A user's own target set as a COCO file."""
 
 from __future__ import annotations
 
@@ -39,27 +39,27 @@ _log = logging.getLogger(__name__)
 class CocoTarget(AnnotatedPhotographs):
     """Photographs with a COCO ``annotations`` file. Annotations of crowds are left out, boxes are clipped.
 
-    ``split_by`` may also be ``attribute:<name>``, an attribute of the file's image entries. Of more images than
-    ``limit`` the first by id are taken.
+    ``split_by`` may also be ``attribute:<name>``, an attribute of the file's image entries. If there are more images
+    than ``limit``, the first by id are taken.
 
     Args:
         annotations: the JSON file.
-        images: the folder its ``file_name`` entries start from; None: the file's own.
-        categories: category name -> object name, null to leave a category out. Names not listed stand for
-            themselves.
-        bin_attribute: the attribute of the file's annotations, or else of their image, that says the pose bin, counted
-            from 1 as ``dominant`` of a distribution is; dots lead into entries of entries (``attributes.pose``). Boxes
-            without one have no bin. None: no box has.
-        match_bins: in all parts take those photographs alone with which each object's bins are distributed as the
-            ``target`` of the first parameter with bins says, see ``neural_sim.target.bin_matching.matching``. Wants
-            photographs of one object.
+        images: folder to which its ``file_name`` entries are relative; None: the file's own folder.
+        categories: category name -> object name, null to leave a category out. Names not listed are the names of their
+            objects.
+        bin_attribute: attribute of the file's annotations, or else of their image, with the pose bin, counted from 1
+            like ``dominant`` of a distribution; dots lead into nested entries (``attributes.pose``). Boxes without it
+            have no bin. None: no box has one.
+        match_bins: in all parts take only photographs such that each object's bins follow the ``target`` of the first
+            parameter with bins, see ``neural_sim.target.bin_matching.matching``. Needs photographs of a single object
+            each.
 
     See ``Photographs`` for the other arguments.
 
     Raises:
-        ValueError: no such file, one that is not in COCO form, a number out of its range, ``match_bins`` without
-            ``bin_attribute``, images that ``split_by`` does not put into two or more groups, a category that is not in
-            the file, or a bin that is none or that no entry has.
+        ValueError: there is no such file, it is not in COCO form, a number is out of its range, ``match_bins`` is set
+            without ``bin_attribute``, ``split_by`` does not give two or more groups, a category is not in the file, or
+            a bin is invalid or no entry has one.
     """
 
     annotations: str | Path
@@ -125,7 +125,7 @@ class CocoTarget(AnnotatedPhotographs):
 
     @cached_property
     def _roots(self) -> list[Path]:
-        """Folders that file names may start from: the one that is set, else the file's and those named ``images``."""
+        """Folders to which file names may be relative: the one set, else the file's and those named ``images``."""
         here = self._folder
         return [here] if self.images is not None else [here, here / "images", here.parent / "images"]
 
@@ -134,13 +134,13 @@ class CocoTarget(AnnotatedPhotographs):
         return Counter(_last(entry) for entry in self._coco.images)
 
     def _path(self, entry: Entry) -> Path:
-        """Return an image's file: of the name as it is written, with ``/``, or in Unicode's other form.
+        """Return an image's file: by its name as written, with ``/``, or in Unicode's other form.
 
-        Where there is none, as where a name has other folders or is an address, it is the file of the last part of the
-        name, if no other image has that.
+        If none exists, such as when the name has other folders or is an address, it is the file with the last part of
+        the name, unless another image has that.
 
         Raises:
-            ValueError: a name that leaves the folder.
+            ValueError: the name leads out of the folder.
         """
         names = _spellings(entry)
         folder = os.path.abspath(self._folder)
@@ -159,7 +159,7 @@ class CocoTarget(AnnotatedPhotographs):
         return f"{self._path(entry)} (named in {self.source})"
 
     def _check_pictures(self) -> None:
-        """Raise ``ValueError`` for pictures that by their headers cannot be read or have another size than listed."""
+        """Raise ``ValueError`` for pictures whose headers cannot be read or show another size than listed."""
         unsized, moved, sizes = [], [], {}
         for entry in self._entries:
             path, where = self._path(entry), self._where(entry)
@@ -192,7 +192,7 @@ class CocoTarget(AnnotatedPhotographs):
         """Return the camera of the file's entry ``camera``, see ``neural_sim.target.camera.camera_of_entry``.
 
         Raises:
-            ValueError: a file without one, or photographs whose listed size is another one.
+            ValueError: the file has no camera, or photographs are listed with another size.
         """
         entry = self._coco.document.get("camera")
         if entry is None:
@@ -251,7 +251,7 @@ class CocoTarget(AnnotatedPhotographs):
             )
 
     def _log_left_out(self, names: Sequence[str], objects: Sequence[str]) -> None:
-        """Count the boxes of categories that are no objects, which ``unmatched=leave_out`` leaves out."""
+        """Log the number of boxes of categories that are not objects, which ``unmatched=leave_out`` drops."""
         strange = {name for name in names if self._classes.object_of(name) not in (None, *objects)}
         known = {entry["id"]: str(entry["name"]) for entry in self._coco.document["categories"]}
         counts = Counter(known[item["category_id"]] for item in self._coco.annotations)
@@ -294,5 +294,5 @@ def _last(entry: Entry) -> str:
 
 
 def _order(entry: Entry) -> tuple[bool, Any]:
-    """Return what entries are sorted by: numbers by value, then texts."""
+    """Return the key by which entries are sorted: numbers by value, then texts."""
     return isinstance(entry["id"], str), entry["id"]

@@ -1,4 +1,4 @@
-"""COCO's annotation files, read and checked as a whole, for targets and for pictures that a detector is tried on."""
+"""COCO's annotation files, read and checked as a whole, for targets and for pictures on which a detector is tried."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ REQUIRED: dict[str, tuple[str, ...]] = {
 }
 OPTIONAL = ("width", "height", "iscrowd")
 LARGEST = 1e9
-"""Pixels that no picture has; also keeps out what is not finite."""
+"""More pixels than any picture has; also excludes numbers that are not finite."""
 Entry = dict[str, Any]
 COCO_KIND = ("category", "categories")
-"""What COCO calls a class, and several."""
+"""COCO's words for a class, and several."""
 
 
 def is_number(value: object) -> bool:
@@ -80,7 +80,7 @@ CHECKS: dict[str, Callable[[object, str], None]] = {
 
 
 def name_of(entry: Entry) -> str:
-    """Return an image entry's ``file_name`` with ``/``, as tools on Windows do not write it."""
+    """Return an image entry's ``file_name`` with ``/``, which tools on Windows do not write."""
     return posixpath.normpath(entry["file_name"].replace("\\", "/"))
 
 
@@ -90,18 +90,18 @@ def has_size(item: Entry) -> bool:
 
 
 def is_crowd(item: Entry) -> bool:
-    """Whether an annotation is of several objects at once, which are no object's box."""
+    """Whether an annotation is of several objects at once, whose box is not an object's."""
     return bool(item.get("iscrowd", 0))
 
 
 def listed_size(entry: Entry) -> tuple[int | float, int | float] | None:
-    """Return the width and height of an image entry, None where it does not say both."""
+    """Return the width and height of an image entry; None unless it has both."""
     width, height = entry.get("width"), entry.get("height")
     return (width, height) if width and height else None  # tools that do not know it write 0
 
 
 def refuse_size(entry: Entry, header: Header, where: str) -> None:
-    """Raise ``ValueError`` for a picture that, as it is shown, has another size than its entry says."""
+    """Raise ``ValueError`` for a picture whose displayed size is not that of its entry."""
     listed = listed_size(entry)
     if listed is not None and listed != header.shown:
         raise ValueError(
@@ -110,7 +110,7 @@ def refuse_size(entry: Entry, header: Header, where: str) -> None:
 
 
 def _upright(item: Entry) -> Entry:
-    """Return an annotation with the box about its box, where that is turned as CVAT writes it."""
+    """Return an annotation with the upright box around its box, if that is rotated as CVAT writes it."""
     attributes = item.get("attributes")
     angle = attributes.get("rotation") if isinstance(attributes, dict) else None
     if not is_number(angle) or not angle or item.get("segmentation"):  # a polygon's box is upright
@@ -124,7 +124,7 @@ def _upright(item: Entry) -> Entry:
 
 @dataclass(frozen=True)
 class CocoFile:
-    """The sections of a file, with the keys of ``REQUIRED``; ``document`` is all that it holds."""
+    """The sections of a file, with the keys of ``REQUIRED``; ``document`` is the whole content."""
 
     path: Path
     document: Mapping[str, Any]
@@ -133,12 +133,12 @@ class CocoFile:
     def read(cls, path: Path) -> CocoFile:
         """Read and check a file.
 
-        Counted in the log are annotations of images that the file does not list, crowds, boxes without a side, those
-        that come twice, and those that are turned, which stand for the upright boxes about them.
+        The log counts annotations of images that the file does not list, crowds, boxes without a side, repeated boxes,
+        and rotated boxes, which are replaced by the upright boxes around them.
 
         Raises:
-            ValueError: not JSON; a section or a key that is missing; an id, a name or a box that is none; an id or a
-                file of several images; or annotations of which no image is listed.
+            ValueError: not JSON; a section or a key is missing; an id, a name or a box is invalid; an id or a file
+                belongs to several images; or there are annotations but no image of theirs is listed.
         """
         document = read_sections(path, tuple(REQUIRED))
         for section, keys in REQUIRED.items():
@@ -170,7 +170,7 @@ class CocoFile:
 
     @cached_property
     def _repeated(self) -> set[int]:
-        """The places of annotations that say what one before says."""
+        """Indices of annotations that repeat an earlier one."""
         seen, repeated = set(), set()
         for row, item in enumerate(self.annotations):
             said = (item["image_id"], item["category_id"], tuple(item["bbox"]))
@@ -180,13 +180,13 @@ class CocoFile:
         return repeated
 
     def check_boxes(self, sizes: Mapping[Any, tuple[int, int]]) -> None:
-        """Check that boxes lie on their pictures; those that reach beyond by more than a pixel are counted in the log.
+        """Check that boxes lie on their pictures; the log counts those that reach beyond by more than a pixel.
 
         Args:
-            sizes: width and height of the pictures by image id; others are not looked at.
+            sizes: width and height of the pictures by image id; boxes of other images are not checked.
 
         Raises:
-            ValueError: boxes that are fractions of the picture or corners, or of which none is on its picture.
+            ValueError: boxes are fractions of the picture or corners, or none of them is on its picture.
         """
         rows = [
             row for row, item in enumerate(self.annotations) if item["image_id"] in sizes and has_size(item)
@@ -207,7 +207,7 @@ class CocoFile:
             raise ValueError(f"{self.path}: no box lies on its picture, {example}: {wanted}")
         corners = torch.cat(
             [boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1
-        )  # what it would be if they were corners
+        )  # what it would be if the numbers were corners
         fits = ((corners[:, 2:] > corners[:, :2]) & (corners[:, 2:] <= limits + 1.0)).all()
         if fits and 2 * int(beyond.sum()) > len(rows):
             raise ValueError(
@@ -221,7 +221,7 @@ class CocoFile:
             )  # fmt: skip
 
     def _check_unique(self, section: str, key: str, other: str) -> None:
-        """Raise ``ValueError`` for two entries with one value of ``key``."""
+        """Raise ``ValueError`` for two entries with the same value of ``key``."""
         first: dict[Any, int] = {}
         for number, entry in enumerate(self.document[section]):
             before = first.setdefault(entry[key], number)
@@ -232,7 +232,7 @@ class CocoFile:
                 )
 
     def check_declared(self) -> None:
-        """Raise ``ValueError`` for an annotation of a category that is not declared."""
+        """Raise ``ValueError`` for an annotation of an undeclared category."""
         declared = {entry["id"] for entry in self.document["categories"]}
         names = {entry["id"]: entry["file_name"] for entry in self.images}
         for number, item in enumerate(self.annotations):
@@ -283,10 +283,10 @@ class CocoFile:
         return [str(entry["name"]) for entry in self.document["categories"] if entry["id"] in used]
 
     def refuse_strange(self, classes: ClassMap, objects: Sequence[str]) -> None:
-        """Refuse categories that are no objects; those without annotations are counted in the log instead.
+        """Refuse categories that are not objects; those without annotations are only logged.
 
         Raises:
-            ValueError: as ``ClassMap.refuse`` does.
+            ValueError: as for ``ClassMap.refuse``.
         """
         used = self.used_names
         classes.refuse(used, objects)
@@ -298,22 +298,22 @@ class CocoFile:
             )
 
     def by_id(self, labels: Mapping[str, int | None]) -> dict[Any, int | None]:
-        """Return the labels of categories by their ids; ``labels`` are by their names."""
+        """Return the labels of categories by their ids; ``labels`` has them by name."""
         return {entry["id"]: labels.get(str(entry["name"])) for entry in self.document["categories"]}
 
     @cached_property
     def usable(self) -> list[int]:
-        """The places of annotations that are boxes of one thing, each once: no crowds and no empty ones."""
+        """Indices of annotations that are boxes of one thing, each once, without crowds and empty boxes."""
         return [
             row for row, item in enumerate(self.annotations)
             if has_size(item) and not is_crowd(item) and row not in self._repeated
         ]  # fmt: skip
 
     def rows_by_image(self, labels: Mapping[Any, int | None]) -> dict[Any, list[int]]:
-        """Return the places of ``usable`` annotations of objects by image id.
+        """Return the indices of ``usable`` annotations of objects, by image id.
 
         Args:
-            labels: label by category id, None for a category that is no object.
+            labels: label by category id, None for a category that is not an object.
         """
         rows: dict[Any, list[int]] = {}
         for row in self.usable:
@@ -323,7 +323,7 @@ class CocoFile:
         return rows
 
     def boxes(self, rows: Iterable[int]) -> Float[Tensor, "b 4"]:
-        """Return (x0, y0, x1, y1) in pixels of the annotations at these places."""
+        """Return (x0, y0, x1, y1) in pixels for the annotations at these indices."""
         boxes = torch.tensor([self.annotations[row]["bbox"] for row in rows], dtype=torch.float32).reshape(
             -1, 4
         )
@@ -331,13 +331,13 @@ class CocoFile:
         return boxes
 
     def bins(self, attribute: str) -> list[int]:
-        """Return the pose bin of each annotation from 0, which the file counts from 1; -1 where nothing says it.
+        """Return the pose bin of each annotation, from 0, where the file counts from 1; -1 if it is unknown.
 
         Args:
-            attribute: of the annotation, or else of its image; dots lead into entries of entries.
+            attribute: attribute of the annotation, or else of its image; dots lead into nested entries.
 
         Raises:
-            ValueError: a bin that is no whole number from 1, or no bin at all.
+            ValueError: a bin is not a whole number from 1, or there is no bin at all.
         """
         where = f"{self.path}: target.bin_attribute={attribute!r}"
         of_image = {entry["id"]: _value(entry, attribute) for entry in self.images}

@@ -1,4 +1,4 @@
-"""Photographs in one folder per class, as ImageNet and ObjectNet have them: the target set of a classifier."""
+"""Photographs in one folder for each class, as in ImageNet and ObjectNet: the target set of a classifier."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ from neural_sim.target.split import evenly, groups_of
 class FolderTarget(AnnotatedPhotographs):
     """Photographs ``<root>/<class>/...`` at any depth. They have no boxes: an image's box is the whole photograph.
 
-    ``split_by`` is searched for in ``<class>/<file>``. Of more photographs of a class than ``limit``, evenly spaced
-    ones by name are taken. With ``unmatched=leave_out`` and ``classes``, every folder that these do not list is left
-    out unread.
+    ``split_by`` is searched in ``<class>/<file>``. If a class has more photographs than ``limit``, evenly spaced ones
+    by name are taken. With ``unmatched=leave_out`` and ``classes``, every folder that is not listed is skipped
+    unread.
 
     Args:
-        root: the folder of the classes' folders.
-        classes: folder's name -> object name, null to leave a folder out. Names not listed stand for themselves.
-        border: pixels that are cut off each side of every photograph, such as ObjectNet's frame of 2.
+        root: the folder that holds the classes' folders.
+        classes: folder name -> object name, null to leave a folder out. Names not listed are the names of their
+            objects.
+        border: number of pixels to cut off each side of every photograph, such as 2 for ObjectNet's frame.
 
-    See ``Photographs`` for the other arguments; ``minimum_side`` is of no matter.
+    See ``Photographs`` for the other arguments; ``minimum_side`` has no effect.
 
     Raises:
-        ValueError: no such folder, no folder with photographs in it, one that ``classes`` names and that is not there,
-            a number out of its range, or photographs that ``split_by`` does not put into two or more groups.
+        ValueError: there is no such folder, no folder in it has photographs, a folder that ``classes`` names does not
+            exist, a number is out of its range, or ``split_by`` does not give two or more groups.
     """
 
     boxed: ClassVar[bool] = False
@@ -91,7 +92,7 @@ class FolderTarget(AnnotatedPhotographs):
 
     @cached_property
     def _groups(self) -> dict[str, str]:
-        """The group of each photograph by its name, of those in folders that may be objects."""
+        """The group of each photograph by name, for folders that may be objects."""
         names = list(self.files())
         groups = names if self.split_by is None else groups_of(names, self.split_by, self.source)
         return dict(zip(names, groups, strict=True))

@@ -1,4 +1,4 @@
-"""A photograph whose objects' poses are known, the reader that a data set has, and what readers share."""
+"""Photographs with known object poses, the reader of a data set, and what readers share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neural_sim.types import PinholeCamera
 
 
 class FrameName(NamedTuple):
-    """A photograph of a data set: its scene, which the split keeps together, and its number there."""
+    """A photograph of a data set: its scene, which the split keeps together, and its number in it."""
 
     scene: str
     number: int
@@ -40,15 +40,15 @@ class PosedObject:
 
     Args:
         name: its class in the data set.
-        object_to_camera: rigid, OpenCV axes (x right, y down, view along +z), metres; from the frame that the data
-            set's own model of the object has.
-        box: (x0, y0, x1, y1) round what is visible of it, along pixel edges, the image spanning [0, width] x
-            [0, height]; None: nothing is.
+        object_to_camera: rigid, OpenCV axes (x right, y down, view along +z), metres; from the frame of the data
+            set's own model of the object.
+        box: (x0, y0, x1, y1) around the visible part, along pixel edges, where the image spans [0, width] x
+            [0, height]; None: nothing is visible.
         visibility: the fraction of the object that is visible, in [0, 1], see the reader.
-        mask: its visible pixels, where the data set has them.
+        mask: its visible pixels, if the data set has them.
 
     Raises:
-        ValueError: a pose that is not rigid, a box that is not ordered, a visibility outside of [0, 1].
+        ValueError: the pose is not rigid, the box is not ordered, or the visibility is outside [0, 1].
     """
 
     name: str
@@ -70,12 +70,12 @@ class PosedObject:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One photograph with its camera, its objects and, where asked for and present, its depth.
+    """One photograph with its camera, its objects and, if requested and present, its depth.
 
     ``depth`` is in metres along the view axis, 0 where unknown.
 
     Raises:
-        ValueError: no such image, or an image, a mask or a depth of another size than the camera's.
+        ValueError: there is no such image, or the image, a mask or the depth has another size than the camera.
     """
 
     scene: str
@@ -101,17 +101,17 @@ class Frame:
 
 
 class FrameReader(Protocol):
-    """The files of a data set: what one photograph is said to show. Which ones there are to take, a target says."""
+    """Reads a data set's files, one photograph at a time. The target decides which photographs to take."""
 
     def class_names(self, scenes: Collection[str]) -> list[str]:
-        """List the data set's classes; where no file has them, those that the scenes show."""
+        """List the data set's classes; if no file has them, those that the scenes show."""
         ...
 
     def frame(self, name: FrameName, depth: bool = False) -> Frame:
-        """Read one photograph, with its depth where that is asked for.
+        """Read one photograph, with its depth if requested.
 
         Raises:
-            ValueError: files that are missing or contradict each other, with the file and what is wrong.
+            ValueError: files are missing or contradict each other; the message has the file and the error.
         """
         ...
 
@@ -120,7 +120,7 @@ class FrameReader(Protocol):
         ...
 
     def files(self, name: FrameName) -> list[Path]:
-        """List the files that its labelled image is made from."""
+        """List the files from which its labelled image is made."""
         ...
 
     def centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:
@@ -132,8 +132,8 @@ def rigid(rotation: Any, translation: Any, where: str) -> Float[np.ndarray, "4 4
     """Return the 4 x 4 pose of a rotation (9 numbers, row by row) and a translation (3).
 
     Raises:
-        ValueError: another number of numbers, some that are not finite, or a matrix that is no rotation to the digits
-            that files round to; ``where`` says whose they are.
+        ValueError: there are too few or too many numbers, some are not finite, or the matrix is not a rotation to the
+            precision to which files round; the message has ``where``.
     """
     pose = np.eye(4)
     pose[:3, :3] = numbers(rotation, 9, f"{where}: rotation").reshape(3, 3)
@@ -154,7 +154,7 @@ def numbers(values: Any, count: int, where: str) -> Float[np.ndarray, "count"]:
     """Return ``count`` finite numbers.
 
     Raises:
-        ValueError: anything else; ``where`` says whose they are.
+        ValueError: anything else; the message has ``where``.
     """
     try:
         made = np.asarray(values, dtype=np.float64).reshape(-1)
@@ -169,8 +169,8 @@ def camera_of_matrix(matrix: Any, width: int, height: int, where: str) -> Pinhol
     """Return the camera of an OpenCV camera matrix (9 numbers, row by row).
 
     Raises:
-        ValueError: a matrix of another form or with skew, or a principal point outside of the image, as one has that
-            belongs to images of another size.
+        ValueError: the matrix has another form or a skew, or its principal point is outside the image, as if it
+            belonged to images of another size.
     """
     k = numbers(matrix, 9, where).reshape(3, 3)
     if k[0, 1] != 0.0 or k[1, 0] != 0.0 or not np.array_equal(k[2], (0.0, 0.0, 1.0)):

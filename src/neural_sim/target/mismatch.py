@@ -1,4 +1,4 @@
-"""How synthesised images differ from a target's in size, place, number, light and sharpness, and what would match."""
+"""How synthesised images differ from a target's in size, position, number, light and sharpness, and what would help."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from neural_sim.types import LabelledImages
 LEVEL = 0.01
 """Family-wise level over all statistics."""
 LARGE = 0.2
-"""Distance of the probability below from one half from which a difference counts, beside its significance."""
+"""Distance of the probability below from one half at which a significant difference counts."""
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 _BLURS = 25
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """One statistic of the target's images and of the synthesised ones, as medians.
+    """One statistic of the target's images and of the synthesised images, as medians.
 
     ``larger`` is the probability that a random target image (or box) has a larger value than a random synthesised one,
-    0.5 without a difference (the Mann-Whitney statistic over its largest value), and ``p_value`` that of equality.
+    0.5 without a difference (the Mann-Whitney statistic over its largest value); ``p_value`` tests for equality.
     """
 
     name: str
@@ -44,10 +44,10 @@ class Mismatch:
 
 
 def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "_"]]:
-    """Return what is compared, a value for each image, or for each box where the name says so.
+    """Return the compared statistics: a value for each image, or for each box if the name says so.
 
-    Sizes and offsets are in fractions of the image's size (of its area's root, and of its half diagonal), brightness
-    and contrast of sRGB values in [0, 1], noise and sharpness of luma.
+    Sizes and offsets are fractions of the image's size (of the root of its area, and of half its diagonal); brightness
+    and contrast are of sRGB values in [0, 1], noise and sharpness of luma.
     """
     height, width = images.images.shape[-2:]
     present = images.present
@@ -69,7 +69,7 @@ def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "_"]]:
 
 
 def mismatches(target: LabelledImages, synthesised: LabelledImages) -> list[Mismatch]:
-    """Every statistic that both have values of."""
+    """Compare every statistic for which both sets have values."""
     pairs = [(name, mine, statistics(synthesised)[name]) for name, mine in statistics(target).items()]
     pairs = [(name, mine, other) for name, mine, other in pairs if len(mine) and len(other)]
     found = []
@@ -85,14 +85,14 @@ def mismatches(target: LabelledImages, synthesised: LabelledImages) -> list[Mism
 
 
 def luma_of(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
-    """Weighted sum of the sRGB channels."""
+    """Compute the weighted sum of the sRGB channels."""
     return torch.einsum("nchw,c->nhw", images, images.new_tensor(_LUMA))
 
 
 def noise(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
     """Estimate the standard deviation of white noise by Immerkaer's difference of two Laplacians.
 
-    It does not see edges that are straight over three pixels (Fast Noise Variance Estimation, 1996). The median
+    It does not respond to edges that are straight over three pixels (Fast Noise Variance Estimation, 1996). The median
     replaces the mean, so that texture counts less; for Gaussian noise |x| has the median 0.6745 sigma, and the mask has
     the norm 6.
     """
@@ -102,7 +102,7 @@ def noise(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
 
 
 def sharpness(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
-    """Mean gradient of the steepest hundredth of pixels, which are edges, between neighbouring pixels."""
+    """Compute the mean gradient between neighbours over the steepest hundredth of pixels, which are edges."""
     steps = torch.stack([luma[:, 1:, :-1] - luma[:, :-1, :-1], luma[:, :-1, 1:] - luma[:, :-1, :-1]]).norm(
         dim=0
     )
@@ -114,14 +114,14 @@ def sharpness(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
 def matching_settings(
     target: LabelledImages, synthesised: LabelledImages, found: list[Mismatch], largest_blur: float = 3.0
 ) -> dict[str, str]:
-    """Return settings that would match what differs, by key; those of ``synthesis`` whose effect is known."""
+    """Return settings of ``synthesis`` that would remove the differences, by key, where their effect is known."""
     differs = {m.name: m for m in found if m.counts}
     settings: dict[str, str] = {}
     mine, other = statistics(target), statistics(synthesised)
     level = 0.0
     if "noise" in differs and differs["noise"].larger > 0.5:
         own = other["noise"].median().square()
-        # Noise of channels that are independent: that of luma over the norm of its weights.
+        # Noise in independent channels: that of luma divided by the norm of its weights.
         scale = math.hypot(*_LUMA)
         low, high = (
             float((mine["noise"].quantile(q).square() - own).clamp_min(0).sqrt() / scale) for q in (0.1, 0.9)
@@ -139,9 +139,9 @@ def matching_settings(
 
 
 def distance_factor(found: list[Mismatch]) -> float | None:
-    """Return the factor on the camera's distances that would give boxes the target's size; None where sizes agree.
+    """Return the factor on the camera's distances that would give boxes the target's size; None if sizes agree.
 
-    Sizes are inversely proportional to distance where objects are small against it.
+    Sizes are inversely proportional to distance for objects that are small compared with it.
     """
     size: Mapping[str, Mismatch] = {m.name: m for m in found}
     if "box size" not in size or not size["box size"].counts:
@@ -152,7 +152,7 @@ def distance_factor(found: list[Mismatch]) -> float | None:
 def _blur_to(wanted: Tensor, synthesised: LabelledImages, largest: float, level: float) -> float:
     """Find the blur, on a grid up to ``largest``, at which the synthesised images' median sharpness is ``wanted``.
 
-    Noise of the target's ``level``, which adds to the steps between pixels, is added after each.
+    Noise of the target's ``level``, which adds to the differences between pixels, is added after each blur.
     """
     deviations, images = torch.linspace(0.0, largest, _BLURS), synthesised.images
     grain = level * torch.randn(images.shape, generator=torch.Generator().manual_seed(0)).to(images)

@@ -1,4 +1,4 @@
-"""Label files that are not COCO's, named as what they are, so that a message can say what to do."""
+"""Label files in other formats than COCO, recognised so that a message can say what to do."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _KINDS = {
     "labelme's format: convert it to COCO": {"shapes"},
     "CreateML's format: convert it to COCO": {"image"},
 }
-"""What a document is, by keys that it or its first entry has."""
+"""The kind of a document, by keys that it or its first entry has."""
 
 
 def missing_file(path: Path) -> str:
-    """Say that a path is no file; of a folder, which files in it may be meant."""
+    """Say that a path is not a file; if it is a folder, which files in it may be meant."""
     if not path.is_dir():
         return f"no such file: {path}"
     found = sorted(file.relative_to(path).as_posix() for file in path.glob("**/*.json"))
@@ -45,10 +45,10 @@ def _of_another_kind(path: Path) -> str:
 
 
 def read_sections(path: Path, sections: Sequence[str]) -> Mapping[str, Any]:
-    """Read a JSON file that has a list by each of these names.
+    """Read a JSON file that has a list for each of these names.
 
     Raises:
-        ValueError: no JSON, or a list that is missing; as far as it can be told, with what the file is instead.
+        ValueError: it is not JSON, or a list is missing; the message has the actual format, if it is recognised.
     """
     if path.suffix.lower() in _SUFFIXES:
         raise ValueError(_of_another_kind(path))
@@ -63,7 +63,7 @@ def read_sections(path: Path, sections: Sequence[str]) -> Mapping[str, Any]:
 
 
 def _kind_of(document: object) -> str:
-    """Say which program's own format a document is in; empty where that is not known."""
+    """Say which program's own format a document is in; empty if it is unknown."""
     first = document[0] if isinstance(document, list) and document else document
     if not isinstance(first, dict):
         return ""

@@ -1,4 +1,4 @@
-"""Photographs from files to tensors: which files there are, their pixels, letterboxed, and the boxes with them."""
+"""Photographs from files to tensors: which files there are, and their pixels and boxes, letterboxed."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ GREY = 0.5
 
 @dataclass(frozen=True)
 class PhotoFiles:
-    """The photographs under a folder, at any depth, or those that a glob (``**`` goes down) or a path names.
+    """The photographs in a folder, at any depth, or those that a glob (``**`` descends) or a path names.
 
     Args:
         where: the folder, glob or path; ``~`` is the user's home.
-        key: the setting that it comes from, for messages.
+        key: the setting that holds it, for messages.
 
     Raises:
-        ValueError: nothing of that name, or no photograph there.
+        ValueError: nothing has this name, or there is no photograph.
     """
 
     where: str
@@ -60,7 +60,7 @@ class PhotoFiles:
         """The files in the order of their names."""
         if self._folder.is_dir():
             return picture_files(self._folder)
-        if self._folder.is_file():  # its name may have signs of a glob
+        if self._folder.is_file():  # its name may contain glob characters
             return [self._folder]
         found = glob.glob(str(self._folder), recursive=True)
         return sorted(path for path in map(Path, found) if path.is_file())
@@ -77,7 +77,7 @@ class PhotoFiles:
         return path.relative_to(self.root).as_posix()
 
     def read(self, path: Path) -> Image.Image:
-        """Read a photograph in RGB, upright. Raises ``ValueError`` where it cannot be read."""
+        """Read a photograph in RGB, upright. Raises ``ValueError`` if it cannot be read."""
         return read_picture(path, f"{self.key}: {path}").convert("RGB")
 
 
@@ -86,7 +86,7 @@ class PhotoFiles:
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Where a photograph of ``width`` x ``height`` lies in the new image (pixels)."""
+    """The position of a photograph of ``width`` x ``height`` in the new image (pixels)."""
 
     width: int
     height: int
@@ -96,12 +96,12 @@ class Letterbox:
     inner_height: int
 
     def boxes(self, boxes: Float[Tensor, "b 4"]) -> Float[Tensor, "b 4"]:
-        """Bring (x0, y0, x1, y1) of the photograph, clipped to it, into the new image."""
+        """Map (x0, y0, x1, y1) from the photograph, clipped to it, to the new image."""
         size, inner, offset = self._sides(boxes)
         return torch.minimum(boxes.clamp_min(0.0), size) * (inner / size) + offset
 
     def of_photo(self, boxes: Float[Tensor, "b 4"]) -> Float[Tensor, "b 4"]:
-        """Bring (x0, y0, x1, y1) of the new image into the photograph, clipped to it: the inverse of ``boxes``."""
+        """Map (x0, y0, x1, y1) from the new image to the photograph, clipped to it: the inverse of ``boxes``."""
         size, inner, offset = self._sides(boxes)
         return torch.minimum(((boxes - offset) * (size / inner)).clamp_min(0.0), size)
 
@@ -110,7 +110,7 @@ class Letterbox:
         return image[:, self.top : self.top + self.inner_height, self.left : self.left + self.inner_width]
 
     def _sides(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return width and height, twice, of the photograph and of its part of the new image, and where that begins."""
+        """Return width and height, twice, of the photograph and of its part of the new image, and the part's origin."""
         size = like.new_tensor([self.width, self.height, self.width, self.height])
         inner = like.new_tensor([self.inner_width, self.inner_height] * 2)
         return size, inner, like.new_tensor([self.left, self.top] * 2)
@@ -140,11 +140,11 @@ class Photograph:
         labels: the class of each box, a position in the run's objects.
         boxes: (x0, y0, x1, y1) in the upright picture's pixels, along their edges; None: one box,
             which is the whole photograph.
-        bins: the pose bin of each box, from 0, -1 where it is unknown; None: no box has one.
-        name: what messages call it.
-        group: what a split keeps together.
-        where: what messages about the file begin with; empty: its path.
-        border: pixels that are cut off each side.
+        bins: the pose bin of each box, from 0, -1 if it is unknown; None: no box has one.
+        name: its name in messages.
+        group: the group that a split keeps together.
+        where: the beginning of messages about the file; empty: its path.
+        border: number of pixels to cut off each side.
     """
 
     path: Path
@@ -160,7 +160,7 @@ class Photograph:
         """Read the photograph at one size, upright.
 
         Raises:
-            ValueError: a file that cannot be read, or nothing left within the border.
+            ValueError: the file cannot be read, or nothing is left within the border.
         """
         photo = read_picture(self.path, self.where).convert("RGB")
         if self.border == 0:
@@ -179,18 +179,18 @@ def read(
 
     Args:
         photographs: at least one.
-        height: of the images, in pixels.
-        width: of the images, in pixels.
+        height: height of the images, in pixels.
+        width: width of the images, in pixels.
         minimum_side: boxes with a shorter side, in pixels of the images, are dropped and counted in the log. A box that
             is the whole photograph is kept.
         source: the data set, for the log.
 
     Returns:
-        The set, boxes padded to the longest list among them, bins by box where some photograph has any; and where each
-        photograph lies in its image.
+        The set, with boxes padded to the longest list among them, and bins by box if some photograph has any; and the
+        position of each photograph in its image.
 
     Raises:
-        ValueError: no photographs, or one that cannot be read.
+        ValueError: there are no photographs, or one cannot be read.
     """
     if not photographs:
         raise ValueError("target: want at least one photograph, got none")
@@ -217,7 +217,7 @@ class Boxes:
 
 
 def _placed(photograph: Photograph, placing: Letterbox, minimum_side: float) -> Boxes:
-    """Bring a photograph's boxes into the letterboxed image, without those that are too small there."""
+    """Map a photograph's boxes into the letterboxed image, without those that are too small there."""
     if photograph.boxes is None:
         whole = torch.tensor([[0.0, 0.0, placing.width, placing.height]])
         return Boxes(placing.boxes(whole), photograph.labels, photograph.bins)
@@ -228,7 +228,7 @@ def _placed(photograph: Photograph, placing: Letterbox, minimum_side: float) -> 
 
 
 def padded(images: Float[Tensor, "n 3 h w"], kept: Sequence[Boxes]) -> LabelledImages:
-    """Label images; boxes are padded to the longest list among them, bins are by box where some image has any."""
+    """Label images; boxes are padded to the longest list among them, bins are by box if some image has any."""
     most = max([1, *(len(one.labels) for one in kept)])
     boxes = torch.zeros(len(kept), most, 4)
     labels, bins = (torch.full((len(kept), most), -1) for _ in range(2))

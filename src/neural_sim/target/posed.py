@@ -1,4 +1,4 @@
-"""Target sets of photographs whose objects' poses are known."""
+"""Target sets of photographs with known object poses."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ Radii = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class PosedTarget(Photographs):
-    """Photographs with poses, which are parted by scenes before any of them is read.
+    """Photographs with poses, which are divided by scenes before any of them is read.
 
-    A subclass says which photographs there are (``listed``) and who reads them (``reader``). ``split_by`` is
-    searched for in ``<scene>/<number>``; None: the photographs of a scene belong together. Of more photographs in a
-    part than ``limit``, evenly spaced ones are taken.
+    A subclass says which photographs there are (``listed``) and which ``reader`` reads them. ``split_by`` is searched
+    in ``<scene>/<number>``; None: the photographs of a scene belong together. If a part has more photographs than
+    ``limit``, evenly spaced ones are taken.
 
     Args:
         root: the data set's folder.
-        classes: class name in the data set -> object name, null to leave a class out. Names not listed stand for
-            themselves.
-        every: keep every n-th photograph of a scene, where no list of the data set says which.
-        min_visibility: objects of which a smaller fraction is visible have no box.
+        classes: class name in the data set -> object name, null to leave a class out. Names not listed are the names of
+            their objects.
+        every: keep every n-th photograph of a scene, unless a list of the data set chooses them.
+        min_visibility: objects with a smaller visible fraction have no box.
 
     See ``Photographs`` for the other arguments.
 
     Raises:
-        ValueError: no such folder, a list or a scene that is missing, a number out of its range, fewer than two groups
-            to part.
+        ValueError: there is no such folder, a list or a scene is missing, a number is out of its range, or there are
+            fewer than two groups to divide.
     """
 
     root: str | Path
@@ -69,14 +69,14 @@ class PosedTarget(Photographs):
     @property
     @abstractmethod
     def reader(self) -> FrameReader:
-        """Who reads the data set's files."""
+        """The reader of the data set's files."""
 
     @abstractmethod
     def listed(self) -> Listed:
         """List the photographs of the data set.
 
         Raises:
-            ValueError: a list or a scene that is missing or cannot be read.
+            ValueError: a list or a scene is missing or cannot be read.
         """
 
     @property
@@ -92,7 +92,7 @@ class PosedTarget(Photographs):
 
     @cached_property
     def _listed(self) -> Listed:
-        """The photographs, of which there are some for each part, and none of a scene in two parts."""
+        """The photographs, checked: there are some for each part, and no scene is in two parts."""
         listed = self.listed()
         if not listed.val or (listed.test is not None and not listed.test):
             raise ValueError(f"{self._root}: holds no photographs for {'test' if listed.val else 'val'}")
@@ -114,7 +114,7 @@ class PosedTarget(Photographs):
 
     @cached_property
     def _groups(self) -> Sequence[Hashable]:
-        """The group of each photograph that is not listed as scored."""
+        """The group of each photograph that is not listed for scoring."""
         if self.split_by is None:
             return [name.scene for name in self._listed.val]
         return groups_of(list(map(str, self._listed.val)), self.split_by, self._root)
@@ -147,10 +147,10 @@ class PosedTarget(Photographs):
 
     @override
     def camera(self) -> PinholeCamera:
-        """Return the camera that took most of the photographs; others are logged.
+        """Return the camera that took most of the photographs; the log mentions others.
 
         Raises:
-            ValueError: photographs of several sizes.
+            ValueError: photographs have several sizes.
         """
         names = self._all
         counted = Counter(map(self.reader.camera, names))
@@ -199,11 +199,11 @@ class PosedTarget(Photographs):
     ) -> LabelledImages:
         """Read any photographs of the data set; labels are positions in ``objects``.
 
-        With ``distribution`` each box has the bin that its pose falls in, see
-        ``neural_sim.target.viewpoint.bins_of_poses``, which ``radii`` (metres, by object) are for.
+        With ``distribution`` each box has the bin of its pose, see ``neural_sim.target.viewpoint.bins_of_poses``, which
+        needs ``radii`` (metres, by object).
 
         Raises:
-            ValueError: files that are missing or contradict each other, a class that is no object.
+            ValueError: files are missing or contradict each other, or a class is not an object.
         """
         unknown = sorted({name for name in (self.classes or {}).values() if name} - set(objects))
         if unknown:
@@ -223,7 +223,7 @@ class PosedTarget(Photographs):
         return ClassMap(self.classes, self._root, unmatched=self.unmatched)
 
     def _strange(self, frame: Frame, labels: Mapping[str, int | None], objects: Sequence[str]) -> list[str]:
-        """List the classes of a photograph that are no objects, unless these are refused."""
+        """List the classes of a photograph that are not objects, unless these are refused."""
         strange = [item.name for item in frame.objects if item.name not in labels]
         if strange and self.unmatched == "refuse":
             raise ValueError(

@@ -25,13 +25,13 @@ _log = logging.getLogger(__name__)
 @validated
 @dataclass(frozen=True)
 class RenderedTarget(Target):
-    """Images rendered at the target distribution, each part with random numbers of its own.
+    """Images rendered at the target distribution; each part has its own random numbers.
 
     Args:
-        val_per_object: images of each object to learn psi on.
-        test_per_object: images of each object to score.
+        val_per_object: number of images of each object for validation, on which psi is learned.
+        test_per_object: number of images of each object to score.
         test_per_biased_object: the same for objects that some parameter's ``biased`` names, whose scores are compared.
-        train_per_object: images that stand for labelled photographs in training (``training.real``); 0: none do.
+        train_per_object: number of images that replace labelled photographs in training (``training.real``); 0: none.
     """
 
     renders: ClassVar[bool] = True
@@ -75,7 +75,7 @@ class RenderedTarget(Target):
         return parts
 
     def _count(self, part: str, biased: bool) -> int:
-        """Return the number of an object's images; with several objects an image, of those drawn for this one."""
+        """Return the number of an object's images; with several objects in an image, of those drawn for this one."""
         if part != "test":
             return self.val_per_object if part == "val" else self.train_per_object
         return self.test_per_biased_object if biased else self.test_per_object

@@ -1,13 +1,14 @@
-"""Parts of a list of photographs for validation, test and training, with whole groups of photographs in each.
+"""Division of a list of photographs into parts for validation, test and training, by whole groups.
 
-Near-duplicates are told by the normalised cross-correlation of local contrast: grey thumbnails of 24 x 24 cells, each
-cell less the mean of the 5 x 5 around it, the best of shifts by up to two cells. Local contrast, because any two
-photographs with the light from above correlate; shifts, because a hand moves the camera.
+Near-duplicates are recognised by the normalised cross-correlation of local contrast: grey thumbnails of 24 x 24 cells,
+each cell minus the mean of the 5 x 5 cells around it, the best over shifts of up to two cells. Local contrast is used
+because any two photographs with light from above correlate; shifts, because hand-held cameras move.
 
 Measured on 600 pictures of each of five kinds (amplitudes falling as 1/f and as f^-1.5, the first also with a bright
-top, and the procedural clutter), every picture against every other: 0.49 at most, one pair in 10,000 above 0.40.
-Pictures against themselves moved by up to 8 % of their width, brighter, with noise of 3 % of their contrast: 0.62 or
-more in nine of ten; consecutive frames of YCB-Video 0.92 or more, frames of different scenes 0.15 at most.
+top, and the procedural clutter), the correlation of every picture with every other was at most 0.49, with one pair in
+10,000 above 0.40. Pictures and their copies moved by up to 8 % of their width, brighter, with noise of 3 % of their
+contrast, had 0.62 or more in nine of ten; consecutive frames of YCB-Video 0.92 or more, frames of different scenes
+0.15 at most.
 """
 
 from __future__ import annotations
@@ -35,19 +36,19 @@ PartOfAll = Annotated[float, Gt(0), Lt(1)]
 ATTRIBUTE = "attribute:"
 CELLS, WINDOW, SHIFT = 24, 5, 2
 ALIKE = 0.6
-"""Correlation from which two photographs count as near-duplicates, between the two sides of the measurement above."""
+"""Correlation above which two photographs count as near-duplicates, between the two sides of the measurement above."""
 COMPARED = 1000
-"""Photographs of one part that are compared with all of another, so that a large set costs seconds."""
+"""Number of photographs of one part that are compared with all of another, so that a large set takes seconds."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What tells which photographs belong together.
+    """The properties by which photographs belong together.
 
     Args:
-        name: the photograph's own, for messages.
-        group: what the split keeps together.
-        image: its letterboxed pixels; equal ones are one photograph.
+        name: the photograph's own name, for messages.
+        group: the group that the split keeps together.
+        image: its letterboxed pixels; photographs with equal ones are the same.
         inside: the part of ``image`` that the photograph fills.
     """
 
@@ -60,11 +61,12 @@ class Look:
 @validated
 @dataclass(frozen=True)
 class Split:
-    """How photographs are parted; the fields are settings of every target of photographs.
+    """How photographs are divided; the fields are settings of every target of photographs.
 
     Args:
-        val_fraction: the part for validation, as near to it as whole groups come; the rest is scored.
-        train_fraction: of the photographs that are not scored, the part for training, whole groups too; None: none.
+        val_fraction: fraction for validation, as near as whole groups allow; the rest is scored.
+        train_fraction: fraction, of the photographs that are not scored, for training, also in whole groups; None:
+            none.
         split_by: what belongs together, see ``groups_of``; None: what the data set says.
     """
 
@@ -73,7 +75,7 @@ class Split:
     split_by: str | None = None
 
     def parts(self, groups: Sequence[Hashable], generator: torch.Generator) -> dict[str, list[int]]:
-        """Part photographs by their groups.
+        """Divide photographs by their groups.
 
         Returns:
             Rows of ``val``, ``test`` and, with a ``train_fraction``, ``train``. No group is in two of them.
@@ -87,18 +89,18 @@ class Split:
     def unscored(
         self, rows: Sequence[int], groups: Sequence[Hashable], generator: torch.Generator
     ) -> dict[str, list[int]]:
-        """Part the photographs that are not scored, which so do not depend on ``train_fraction``.
+        """Divide the photographs that are not scored; which ones these are does not depend on ``train_fraction``.
 
         Args:
             rows: those photographs.
             groups: the groups of all photographs.
-            generator: of the random choice.
+            generator: source of the random choice.
 
         Returns:
             ``rows`` as ``val`` and, with a ``train_fraction``, ``train``.
 
         Raises:
-            ValueError: rows of a single group, which cannot be parted.
+            ValueError: the rows belong to a single group, which cannot be divided.
         """
         if self.train_fraction is None:
             return {"val": list(rows)}
@@ -115,18 +117,18 @@ class Split:
     def parts_by_look(
         self, looks: Sequence[Look], generator: torch.Generator, source: object
     ) -> dict[str, list[int]]:
-        """Part photographs by their groups, where equal photographs are of one group.
+        """Divide photographs by their groups, with equal photographs in one group.
 
-        Without ``split_by``, near-duplicates in two parts are warned of: where one frame of a video trained a detector
-        or chose psi, the score on the next frame says little.
+        Without ``split_by``, near-duplicates in two parts give a warning: if one frame of a video trained a detector or
+        chose psi, the score on the next frame says little.
 
         Args:
             looks: the photographs.
-            generator: of the random choice.
+            generator: source of the random choice.
             source: their file or folder, for messages.
 
         Returns:
-            Rows as of ``parts``.
+            Rows as from ``parts``.
         """
         pixels = [hashlib.sha256(look.image.numpy().tobytes()).digest() for look in looks]
         parts = self.parts(joined([look.group for look in looks], pixels), generator)
@@ -156,19 +158,19 @@ def groups_of(
     source: object,
     entries: Sequence[Mapping[str, Any]] | None = None,
 ) -> list[str]:
-    """Return the group of each photograph, such as the scene or the video that it is of.
+    """Return the group of each photograph, such as its scene or video.
 
     Args:
         names: the photographs' file names.
-        split_by: ``attribute:<name>``, the group is that attribute of the photograph's entry; else a regular
-            expression that is searched for in the name: the group is its first capture group, or the whole match where
-            it has none.
-        source: where the photographs are from, for messages.
-        entries: the photographs' entries; None: there are none, so that a regular expression is wanted.
+        split_by: ``attribute:<name>``: the group is that attribute of the photograph's entry; otherwise a regular
+            expression that is searched in the name: the group is its first capture group, or the whole match if it has
+            none.
+        source: origin of the photographs, for messages.
+        entries: the photographs' entries; None: there are none, so that a regular expression is needed.
 
     Raises:
-        ValueError: a regular expression that does not compile, a photograph that it does not match or that lacks the
-            attribute, or fewer than two groups.
+        ValueError: the regular expression does not compile, it does not match a photograph, a photograph lacks the
+            attribute, or there are fewer than two groups.
     """
     where = f"target.split_by={split_by!r}, {source}"
     if not split_by.startswith(ATTRIBUTE):
@@ -210,24 +212,23 @@ def split(
     generator: torch.Generator,
     parts: tuple[str, str] = ("validation", "test"),
 ) -> tuple[Int[Tensor, "first"], Int[Tensor, "second"]]:
-    """Split photographs in two parts, with whole groups in each and neither part empty.
+    """Divide photographs into two parts of whole groups, neither of them empty.
 
-    Groups are put in random order. The first part gets as many photographs as groups allow that is nearest to
-    ``fraction`` of all, the smaller of two equally near; of the choices of groups that have that number, the one that
-    needs the fewest groups in that order. Where every photograph is a group of its own, that is a random part of
-    exactly the size asked for.
+    Groups are put in random order. The first part gets the number of photographs, among those that groups allow, that
+    is nearest to ``fraction`` of all (the smaller of two equally near ones), made up of the fewest groups in that
+    order. If every photograph is its own group, this is a random part of exactly the requested size.
 
     Args:
         groups: the group of each photograph.
-        fraction: the first part's, in (0, 1).
-        generator: of the random order.
-        parts: what the two are called in messages.
+        fraction: fraction for the first part, in (0, 1).
+        generator: source of the random order.
+        parts: names of the two parts in messages.
 
     Returns:
         Rows of the two parts.
 
     Raises:
-        ValueError: a fraction outside (0, 1), one that leaves a part empty, or fewer than two groups.
+        ValueError: the fraction is outside (0, 1) or leaves a part empty, or there are fewer than two groups.
     """
     first, second = parts
     if not 0.0 < fraction < 1.0:
@@ -254,10 +255,10 @@ def split(
 
 
 def nearest(sizes: Sequence[int], wanted: int) -> set[int]:
-    """Choose the ``sizes`` whose sum is nearest to ``wanted``, among all sums but none and all.
+    """Choose the ``sizes`` whose sum is nearest to ``wanted``, among all sums except of none and of all.
 
-    Subset sum by dynamic programming: bit s of ``reached`` says whether the sizes so far can add up to s,
-    ``last[s]`` is the position that first made it so.
+    Subset sum by dynamic programming: bit s of ``reached`` says whether the sizes so far can add up to s;
+    ``last[s]`` is the position that first made it possible.
 
     Returns:
         Positions in ``sizes``.
@@ -291,7 +292,7 @@ def joined(groups: Sequence[Hashable], equal: Sequence[Hashable]) -> list[int]:
     """Join groups of photographs that share a value of ``equal``, such as a digest of pixels.
 
     Returns:
-        For each photograph the row of the first one in its joined group.
+        For each photograph, the row of the first one in its joined group.
     """
     first: dict[tuple[str, Hashable], int] = {}
     parent = list(range(len(groups)))
@@ -309,7 +310,7 @@ def joined(groups: Sequence[Hashable], equal: Sequence[Hashable]) -> list[int]:
 
 
 class NearDuplicates(NamedTuple):
-    """Rows of a second part that look like a row of a first, that row for each, and how many were compared."""
+    """Rows of a second part that look like a row of a first, that row for each, and the number that was compared."""
 
     second: list[int]
     first: list[int]
@@ -338,7 +339,7 @@ def thumbnail(photo: Float[Tensor, "3 height width"]) -> Float[Tensor, "24 24"]:
 
 
 def correlation(first: Float[Tensor, "n 24 24"], second: Float[Tensor, "m 24 24"]) -> Float[Tensor, "n m"]:
-    """Correlate thumbnails, the largest over the shifts; a plain photograph correlates with none."""
+    """Compute the largest correlation of thumbnails over shifts; a plain photograph correlates with none."""
     inner, width = slice(SHIFT, -SHIFT), CELLS - 2 * SHIFT
     centre = _normalised(first[:, inner, inner])
     best = torch.full((len(first), len(second)), -1.0)

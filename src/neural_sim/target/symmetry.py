@@ -1,4 +1,4 @@
-"""Which bins of a factor an object's symmetry makes the same, so that mass in any of them counts as mass in each."""
+"""Which bins of a factor an object's symmetry makes equal, so that probability in any of them counts for each."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def equivalent_bins(
 ) -> list[list[int]]:
     """Group a factor's bins (from 0) whose views agree, in lists that cover all bins.
 
-    Two bins belong together when, under one of four alignments of the angles within them (the offset in the bin and the
-    second angle, each as it is or mirrored about the middle of its range), the mean absolute difference of their
-    premultiplied views over the pixels that either covers is below ``tolerance``. A second angle that goes round the
-    full circle is tried half a turn on, too. Views of every bin use the same ``samples`` offsets and second angles;
-    what the factor does not draw is at the middle of its range.
+    Two bins belong together if their premultiplied views agree under one of four alignments of the angles within them
+    (the offset in the bin and the second angle, each unchanged or mirrored about the middle of its range): the mean
+    absolute difference over the pixels that either view covers must be below ``tolerance``. A second angle that goes
+    round the full circle is also tried half a turn on. Views of every bin use the same ``samples`` offsets and second
+    angles; other coordinates are at the middle of their range.
     """
     count = next(f.bins for f in distribution.binned if f.name == factor)
     views = _views(item, distribution, factor, camera, count, samples)
@@ -53,7 +53,7 @@ def _views(
     bins: int,
     samples: int,
 ) -> Float[Tensor, "bins alignments samples h w 4"]:
-    """Premultiplied views of every bin under every alignment, of one render: a mesh's texture is prepared once."""
+    """Render premultiplied views of every bin and alignment in one pass, which prepares a mesh's texture once."""
     offsets = (torch.arange(samples) + 0.5) / samples
     other = torch.linspace(0.1, 0.9, samples)[torch.arange(samples) * 5 % samples]
     turns = (0.0, 0.5) if _second_goes_round(distribution, factor) else (0.0,)
@@ -69,7 +69,7 @@ def _views(
 
 
 def _second_goes_round(distribution: SceneDistribution, factor: str) -> bool:
-    """Whether the angle beside the factor's own covers the full circle."""
+    """Whether the angle that is not the factor's own covers the full circle."""
     own = next(f.coordinate for f in distribution.binned if f.name == factor)
     second = "phi" if own == "rho" else "rho"
     low, high = next(((f.low, f.high) for f in distribution.binned if f.coordinate == second),
@@ -84,7 +84,7 @@ def _at(
     within: Float[Tensor, "n"],
     other: Float[Tensor, "n"],
 ) -> SceneDraw:
-    """Scenes in one bin of a factor, angles it does not draw at the fractions ``other`` of their ranges."""
+    """Return scenes in one bin of a factor, with other angles at the fractions ``other`` of their ranges."""
     middle = torch.full_like(within, 0.5)
     uniform = {name: other if name in ("phi", "rho") else middle for name in COORDINATES}
     bins, still = {}, {}

@@ -1,4 +1,4 @@
-"""Annotations of photographs that a detector is tried on, in the photographs' own pixels."""
+"""Ground truth of photographs on which a detector is tried, in the photographs' own pixels."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Truth:
-    """The COCO file ``path`` as classes of a detector and as entries of ``photos``.
+    """The COCO file ``path``, with a detector's classes and the entries of ``photos``.
 
     ``categories`` maps the file's category names to class names, null to leave one out. A photograph's entry is the one
-    whose ``file_name`` is its path below the photographs' folder or below the file's, else the only one of its name.
+    whose ``file_name`` is its path below the photographs' folder or the file's folder, else the only one with its name.
 
     Raises:
-        ValueError: no such file, one that is not in COCO form, a category without a class, no entry for any of the
-            photographs, or one that says another size.
+        ValueError: there is no such file, it is not in COCO form, a category has no class, no photograph has an entry,
+            or an entry states another size.
     """
 
     path: Path
@@ -79,7 +79,7 @@ class Truth:
 
     @cached_property
     def labels(self) -> dict[Any, int | None]:
-        """Class index by category id, None for a category left out."""
+        """Class index by category id; None for a category that is left out."""
         names = self._file.category_names
         source = f"predict.annotations: {self.path}"
         classes = ClassMap(self.categories, source, "predict.categories", COCO_KIND, None)
@@ -89,7 +89,7 @@ class Truth:
 
     @cached_property
     def category_ids(self) -> dict[int, Any]:
-        """Category id by class index: the first that stands for a class. A class without one is missing."""
+        """Category id by class index, the first one that maps to the class. Classes without one are missing."""
         found: dict[int, Any] = {}
         for id, label in self.labels.items():
             if label is not None:
@@ -116,11 +116,11 @@ class Truth:
 
     @cached_property
     def _rows(self) -> dict[Any, list[int]]:
-        """The places of annotations by image id."""
+        """Indices of annotations by image id."""
         return self._file.rows_by_image(self.labels)
 
     def boxes(self, path: Path) -> tuple[Float[Tensor, "b 4"], Int[Tensor, "b"]]:
-        """Return (x0, y0, x1, y1) in pixels, and class indices, of a photograph that has an entry, without crowds."""
+        """Return (x0, y0, x1, y1) in pixels, and class indices, of a photograph with an entry, without crowds."""
         entry = self.entries[path]
         rows = self._rows.get(entry["id"], [])
         labels = [self.labels[self._file.annotations[row]["category_id"]] for row in rows]
@@ -128,11 +128,11 @@ class Truth:
 
 
 def without_pixels(truths: Sequence[tuple[Tensor, Tensor]]) -> LabelledImages:
-    """Return boxes and labels of several photographs as a set to score detections on, which needs no pixels."""
+    """Return boxes and labels of several photographs as a set for scoring detections, which needs no pixels."""
     return padded(torch.zeros(len(truths), 3, 1, 1), [Boxes(*truth) for truth in truths])
 
 
 def _below(path: Path, folder: Path) -> str:
-    """Return a path below a folder with ``/``; empty where it lies elsewhere."""
+    """Return a path below a folder with ``/``; empty if it lies elsewhere."""
     path, folder = path.resolve(), folder.resolve()
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else ""

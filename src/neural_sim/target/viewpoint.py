@@ -1,4 +1,4 @@
-"""From which side a camera sees an object: the inverse of the project's orbit, and the bin of p_psi it falls in."""
+"""The side from which a camera sees an object: the inverse of the project's orbit, and the bin of p_psi there."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neural_sim.types import SceneDraw
 
 TURN = 2.0 * math.pi
 SAME = 1e-6
-"""Radians by which two names of one viewpoint may differ in how far they lie outside of the ranges."""
+"""Tolerance in radians when two names of one viewpoint are compared by how far they lie outside the ranges."""
 Range = tuple[float, float]
 
 
@@ -22,8 +22,8 @@ Range = tuple[float, float]
 class Viewpoint:
     """Cameras as ``neural_sim.cameras.orbit`` places them, float64.
 
-    ``phi`` and ``rho`` are its angles in radians, ``distance`` is that from the object's centre, in the unit of the
-    poses. ``roll`` in [-pi, pi] turns the orbit's camera about its own backward axis, anticlockwise seen from behind:
+    ``phi`` and ``rho`` are its angles in radians; ``distance`` is measured from the object's centre, in the unit of the
+    poses. ``roll``, in [-pi, pi], turns the orbit's camera about its own backward axis, anticlockwise seen from behind:
     camera_to_world = orbit(phi, rho, distance) Rz(roll), for a camera that looks straight at the object's centre.
     """
 
@@ -39,32 +39,32 @@ def viewpoint_of(
     phi_range: Range = (0.0, TURN),
     rho_range: Range = (-math.pi, math.pi),
 ) -> Viewpoint:
-    """Find the orbit's camera that sees an object from the side from which a real camera sees it.
+    """Find the orbit's camera that sees an object from the same side as a real camera.
 
-    An orbit's camera looks straight at the object, a real one rarely does. Its direction from the object is kept, and
-    it is turned to face the object by the smallest rotation that does; what is left over is the roll. Where the object
-    lies in the image has no part in the angles.
+    An orbit's camera looks straight at the object; a real camera rarely does. Its direction from the object is kept,
+    and it is turned to face the object by the smallest possible rotation; what remains is the roll. The object's
+    position in the image does not affect the angles.
 
-    (phi, rho, roll) and (-phi, rho + pi, roll + pi) are one camera. Of the two, the one is taken that lies within the
-    ranges, or that misses them by less; if both do alike, as where both ranges are full circles, the one of the smaller
-    roll. Angles are given within half a turn of the middle of their range. At the poles, where rho and roll turn alike,
-    rho is 0 or pi.
+    (phi, rho, roll) and (-phi, rho + pi, roll + pi) are one camera. Of the two, the one within the ranges is taken, or
+    the one that misses them by less; if both are equal in this, such as when both ranges are full circles, the one with
+    the smaller roll. Angles are given within half a turn of the middle of their range. At the poles, where rho and roll
+    have the same effect, rho is 0 or pi.
 
     Args:
         object_to_camera: rigid, OpenCV axes (x right, y down, view along +z); the object stands upright along its +z.
-        centre: of the object in its own frame, in the unit of the poses; None: its origin.
-        phi_range: the first angles that are drawn, in radians.
-        rho_range: the second angles that are drawn, in radians.
+        centre: the object's centre in its own frame, in the unit of the poses; None: the origin.
+        phi_range: range of the first angle, in radians.
+        rho_range: range of the second angle, in radians.
 
     Raises:
-        ValueError: a camera that stands in the object's centre, or has it straight behind its back.
+        ValueError: a camera is at the object's centre, or has it straight behind its back.
     """
     pose = object_to_camera.double()
     turn, offset = pose[:, :3, :3], pose[:, :3, 3]
     if centre is not None:
         offset = offset + torch.einsum("nij,nj->ni", turn, centre.double().expand(len(pose), 3))
     distance = offset.norm(dim=-1)
-    # The camera's OpenGL axes in the object's frame are rows of the rotation, z the other way round.
+    # The camera's OpenGL axes in the object's frame are rows of the rotation, with z reversed.
     right, backward = turn[:, 0], -turn[:, 2]
     toward = -torch.einsum("nij,ni->nj", turn, offset) / distance.clamp_min(1e-300)[:, None]
     if not bool((distance > 0.0).all() and ((backward * toward).sum(-1) > -1.0 + 1e-12).all()):
@@ -91,11 +91,12 @@ def bins_of_poses(
     radius: float | None,
     centre: Float[Tensor, "#n 3"] | None = None,
 ) -> Int[Tensor, "n"]:
-    """Return the bin of each pose by the first binned factor of p_psi, from 0, as ``LabelledImages.bins`` has it.
+    """Return the bin of each pose by the first binned factor of p_psi, from 0, as in ``LabelledImages.bins``.
 
-    Poses are in metres; ``radius`` is that of the object's sphere, None where nobody knows it. -1 where the factor is
-    not told by a pose: a focal length, a distance in radii of an object of unknown size, no binned factor. A distance
-    outside of the range falls in the bin at that end.
+    Poses are in metres; ``radius`` is that of the object's sphere, None if unknown. -1 if the pose does not determine
+    the
+    factor: a focal length, a distance in radii of an object of unknown size, or no binned factor. A distance outside
+    the range falls into the bin at that end.
     """
     unknown = torch.full((len(object_to_camera),), -1)
     first = next(iter(distribution.binned), None)
@@ -113,14 +114,14 @@ def bins_of_poses(
 
 
 def _turned(axis: Tensor, start: Tensor, end: Tensor) -> Float[Tensor, "n 3"]:
-    """``axis`` under the smallest rotation that takes the unit vector ``start`` to ``end``, by Rodrigues' formula."""
+    """Rotate ``axis`` by the smallest rotation that takes the unit vector ``start`` to ``end`` (Rodrigues' formula)."""
     normal = torch.linalg.cross(start, end)
     once = torch.linalg.cross(normal, axis)
     return axis + once + torch.linalg.cross(normal, once) / (1.0 + (start * end).sum(-1, keepdim=True))
 
 
 def _orbit_axes(phi: Tensor, rho: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Right and up of the orbit's camera."""
+    """Return right and up of the orbit's camera."""
     up = torch.stack([-phi.cos() * rho.cos(), -phi.cos() * rho.sin(), phi.sin()], -1)
     return torch.stack([-rho.sin(), rho.cos(), torch.zeros_like(rho)], -1), up
 
@@ -128,7 +129,7 @@ def _orbit_axes(phi: Tensor, rho: Tensor) -> tuple[Float[Tensor, "n 3"], Float[T
 def _named(
     phi: Tensor, rho: Tensor, roll: Tensor, phi_range: Range, rho_range: Range
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the same angles in the turn about the middle of their ranges, the roll in the turn about 0."""
+    """Return the same angles in the turn around the middle of their ranges, and the roll in the turn around 0."""
     middles = 0.5 * sum(phi_range), 0.5 * sum(rho_range), 0.0
     phi, rho, roll = (
         middle + torch.remainder(angle - middle + math.pi, TURN) - math.pi
@@ -138,5 +139,5 @@ def _named(
 
 
 def _outside(angle: Tensor, range_: Range) -> Tensor:
-    """By how much an angle lies outside of its range."""
+    """Return by how much an angle lies outside its range."""
     return ((angle - 0.5 * sum(range_)).abs() - 0.5 * (range_[1] - range_[0])).clamp_min(0.0)

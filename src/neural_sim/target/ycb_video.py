@@ -41,7 +41,7 @@ CLASSES = (
     "019_pitcher_base", "021_bleach_cleanser", "024_bowl", "025_mug", "035_power_drill", "036_wood_block",
     "037_scissors", "040_large_marker", "051_large_clamp", "052_extra_large_clamp", "061_foam_brick",
 )  # fmt: skip
-"""The data set's classes 1 to 21, whose names are those of the objects' folders."""
+"""The data set's classes 1 to 21, named like the objects' folders."""
 Box = tuple[float, float, float, float]
 _ELEMENTS, _MATRIX, _COMPRESSED = frozenset({*range(1, 8), 9, *range(12, 19)}), 14, 15
 """Types of the elements of a MATLAB file, version 5."""
@@ -53,9 +53,9 @@ class YcbVideoTarget(PosedTarget):
     """Photographs of YCB-Video.
 
     Args:
-        val_list: the list of ``image_sets`` for validation, one in ``every`` photographs of each scene; None: ``train``
-            where present, else scenes without another part.
-        test_list: the list that is scored, all of it; None: ``keyframe`` where present, else scenes without another
+        val_list: the list in ``image_sets`` for validation, with one in ``every`` photographs of each scene; None:
+            ``train`` if present, else scenes without another part.
+        test_list: the list that is scored, all of it; None: ``keyframe`` if present, else scenes without another
             part.
 
     See ``PosedTarget`` for the other arguments.
@@ -82,7 +82,7 @@ class YcbVideoTarget(PosedTarget):
         return Listed(val, self._without(val) if test is None else test)
 
     def _without(self, taken: Sequence[FrameName]) -> list[FrameName]:
-        """Keep every n-th photograph of the scenes that ``taken`` has none of."""
+        """Keep every n-th photograph of the scenes from which ``taken`` has none."""
         scenes = {name.scene for name in taken}
         return self._thinned([name for name in self.reader.names if name.scene not in scenes])
 
@@ -93,7 +93,7 @@ class YcbVideoTarget(PosedTarget):
         return [name for scene in scenes.values() for name in scene[:: self.every]]
 
     def _list(self, key: str, given: str | None, usual: str) -> list[FrameName] | None:
-        """Read the photographs of a list; None where none is given and there is no usual one."""
+        """Read the photographs of a list; None if none is given and the usual one does not exist."""
         path = self._root / "image_sets" / f"{given or usual}.txt"
         if not path.is_file():
             if given is None:
@@ -102,7 +102,7 @@ class YcbVideoTarget(PosedTarget):
         names = []
         for number, line in enumerate(_text(path).split(), 1):
             scene, _, frame = line.removeprefix("data/").rpartition("/")
-            if scene == "data_syn":  # rendered images, which are no target
+            if scene == "data_syn":  # rendered images, which do not belong to the target
                 continue
             if not scene or "/" in scene or not frame.isdigit():
                 raise ValueError(f"{path}: line {number}: want <scene>/<frame>, got {line!r}")
@@ -117,10 +117,10 @@ class YcbVideoTarget(PosedTarget):
 
 @dataclass(frozen=True)
 class YcbVideoScenes(FrameReader):
-    """The files of YCB-Video. An object's centre is taken to be its poses' origin.
+    """The files of YCB-Video. An object's centre is assumed to be the origin of its poses.
 
-    An object's visibility is the fraction of its whole projection's box (clipped to the image) that the box of its
-    visible pixels covers: the data set has no masks of whole objects.
+    An object's visibility is the fraction of the box of its whole projection (clipped to the image) that the box of its
+    visible pixels covers, because the data set has no masks of whole objects.
     """
 
     root: Path
@@ -185,7 +185,7 @@ class YcbVideoScenes(FrameReader):
         return [self.file(name, end) for end in ("color.png", "label.png", "box.txt", "meta.mat")]
 
     def file(self, name: FrameName, end: str) -> Path:
-        """Return the file of a photograph whose name ends so."""
+        """Return the file of a photograph with this ending."""
         return self.root / "data" / name.scene / f"{name.number:06d}-{end}"
 
 
@@ -208,7 +208,7 @@ def _poses(poses: np.ndarray, classes: Sequence[int], meta: Path) -> list[np.nda
 
 
 def _boxes(path: Path, size: tuple[int, int]) -> dict[str, Box | None]:
-    """Read the boxes of whole projections by class, along pixel edges and clipped to the image; None: outside of it."""
+    """Read the boxes of whole projections by class, along pixel edges and clipped to the image; None: outside it."""
     lines = _text(path).splitlines()
     boxes: dict[str, Box | None] = {}
     for number, words in enumerate(map(str.split, lines), 1):
@@ -237,14 +237,14 @@ def _visibility(visible: Box | None, whole: Box | None) -> float:
 
 
 def _check_elements(data: bytes, order: str) -> None:
-    """Check the tags of a MATLAB file's elements, and of those in them: scipy crashes on types that there are not.
+    """Check the tags of a MATLAB file's elements, nested ones included: scipy crashes on unknown types.
 
     Args:
         data: elements one after the other: type and size, or both in four bytes for those of up to four, then content.
-        order: of bytes, ``<`` or ``>``.
+        order: byte order, ``<`` or ``>``.
 
     Raises:
-        ValueError: a type that is unknown, or an element beyond the end.
+        ValueError: a type is unknown, or an element reaches beyond the end.
     """
     at = 0
     while at < len(data):
@@ -275,7 +275,7 @@ def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     drops trailing dimensions of size 1: the poses of one object are 3 x 4, those of two 3 x 4 x 2.
 
     Raises:
-        ValueError: a file that is missing or no MATLAB file, or lacks a name.
+        ValueError: the file is missing, is not a MATLAB file, or lacks a name.
     """
     require("bop", str(path))
     import h5py
@@ -292,7 +292,7 @@ def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
             data = path.read_bytes()
             _check_elements(data[128:], "<" if data[126:128] == b"IM" else ">")
             found = scipy.io.loadmat(path, variable_names=list(names))
-    except Exception as error:  # both readers raise whatever damaged numbers lead to
+    except Exception as error:  # both readers raise whatever damaged numbers cause
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}: not a readable MATLAB file ({reason})") from error
     lacking = [name for name in names if name not in found]

@@ -1,8 +1,8 @@
-"""Two guesses of a crop's bins, by the network and by its box alone, and the calibrated posterior of both.
+"""Two guesses of a crop's bins, one by the network and one by its box alone, and their calibrated posterior.
 
-A network that few renders trained knows them by heart: of four bins of distance it told half of other renders right,
-where the size of the box alone tells nine of ten. So a quadratic logistic regression reads the box, and held-out
-renders find out how much to believe each (Wolpert 1992): posteriors are the softmax of a_1 z_1 + a_2 z_2 + b with
+A network trained on few renders memorises them: of four bins of distance, it recognised half of other renders, where
+the size of the box alone recognises nine of ten. A quadratic logistic regression therefore reads the box, and held-out
+renders determine how much to trust each guess (Wolpert 1992): posteriors are the softmax of a_1 z_1 + a_2 z_2 + b with
 weights a >= 0 for the logits z of each guess, and a bias b for each combination of bins.
 """
 
@@ -24,11 +24,11 @@ class BoxReader:
     """Logistic regressions of every factor's bins on the numbers of one object's boxes and their products.
 
     Attributes:
-        low: smallest numbers of the boxes that it was fitted to; others count as these, for squares do not extrapolate.
-        high: largest ones.
-        centre: of the numbers.
-        spread: their standard deviation, 1 of what does not vary.
-        weights: of every factor, of a constant, the numbers and their products.
+        low: smallest box numbers in the fit; smaller ones are raised to these, because squares do not extrapolate.
+        high: largest box numbers in the fit, likewise.
+        centre: means of the numbers.
+        spread: their standard deviations, 1 for numbers that do not vary.
+        weights: for every factor, of a constant, the numbers and their products.
         cells: the combinations of bins.
     """
 
@@ -43,7 +43,7 @@ class BoxReader:
     def fitted(
         numbers: Float[Tensor, "n d"], known: Int[Tensor, "n"], cells: Cells, ridge: float = 1.0
     ) -> BoxReader:
-        """Fit to boxes of renders of ``known`` cells; ``ridge``: half the weight of squares of all but constants."""
+        """Fit to boxes of renders in ``known`` cells; ``ridge``: half the penalty on squares of all but constants."""
         numbers = numbers.double()
         centre, spread = numbers.mean(0), numbers.std(0)
         spread = torch.where(spread > 1e-6, spread, torch.ones_like(spread))
@@ -53,7 +53,7 @@ class BoxReader:
         return BoxReader(numbers.amin(0), numbers.amax(0), centre, spread, weights, cells)
 
     def __call__(self, numbers: Float[Tensor, "n d"]) -> Float[Tensor, "n cells"]:
-        """Return logits of the cells, the sums of those of their bins."""
+        """Return logits of the cells, each the sum of its bins' logits."""
         numbers = numbers.double().clamp(self.low, self.high)
         terms = _terms((numbers - self.centre) / self.spread)
         parts = [terms @ weights for weights in self.weights]
@@ -83,7 +83,7 @@ def _regressed(
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated logits are the guesses' weighted sum and a bias, by sample of the renders that they were found on."""
+    """Calibrated logits, a weighted sum of the guesses plus a bias, for each sample of the renders that gave them."""
 
     weights: Float[Tensor, "samples guesses 1 1"]
     bias: Float[Tensor, "samples 1 cells"]
@@ -103,9 +103,9 @@ def calibrate(
 
     Args:
         guesses: logits of held-out renders of one object.
-        cells: their true ones.
-        samples: how often each render is in several samples of them; None: one sample of all.
-        ridge: weight of the biases' squares, in renders; keeps those of few renders near 0.
+        cells: the renders' true cells.
+        samples: number of times that each render is in each of several samples; None: one sample of all.
+        ridge: penalty on the biases' squares, in renders; keeps biases from few renders near 0.
     """
     counts = guesses.new_ones(1, len(cells)) if samples is None else samples.to(guesses)
     shape = (len(counts), len(guesses), 1, 1)

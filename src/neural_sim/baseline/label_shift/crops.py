@@ -1,4 +1,4 @@
-"""Crops about labelled boxes with what the box itself says, and augmentations that cover what renders lack."""
+"""Crops around labelled boxes, with the boxes' own numbers, and augmentations for what renders lack."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from neural_sim.ranges import Fraction, NonNegative, validated
 from neural_sim.types import LabelledImages
 
 SIDE = 32
-"""Pixels a side of what the network sees."""
+"""Side in pixels of the network's input."""
 MARGIN = 1.5
-"""Side of a stored crop in sides of the box, so that a turn or a shift finds pixels."""
+"""Side of a stored crop in sides of the box, so that rotations and shifts still find pixels."""
 _STORED = 44
-_SHOWN = 1.1  # side of what the network sees, in sides of the box
+_SHOWN = 1.1  # side of the network's input, in sides of the box
 BOX_NUMBERS = 5
-"""Numbers that describe a box."""
+"""Number of values that describe a box."""
 SIZE = (0, 1, 4)
-"""Those that say how large it is: width, height and whether the border may cut it off."""
+"""Those values that describe its size: width, height and whether the border may cut it off."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Crops:
     """Square crops about boxes.
 
     Attributes:
-        pixels: in [0, 1], ``MARGIN`` sides of the box across; what lies outside of the image is its mean colour.
+        pixels: pixels in [0, 1] of ``MARGIN`` sides of the box; outside the image they have its mean colour.
         boxes: logarithms of width and height as fractions of the image's, the centre from -1 to 1, and whether the box
             touches the border.
-        labels: class of each.
-        rows: its image in the set.
+        labels: class of each crop.
+        rows: row of its image in the set.
     """
 
     pixels: Float[Tensor, "n 3 side side"]
@@ -50,7 +50,7 @@ class Crops:
         return len(self.labels)
 
     def select(self, index: Tensor) -> Crops:
-        """Select some."""
+        """Select some crops."""
         return Crops(*(getattr(self, part.name)[index] for part in fields(Crops)))
 
     @staticmethod
@@ -60,7 +60,7 @@ class Crops:
 
 
 def crops_of(images: LabelledImages, whole: bool) -> Crops:
-    """Cut out all labelled boxes, image by image; the whole images where boxes mean nothing (``whole``)."""
+    """Cut out all labelled boxes, image by image; with ``whole``, the whole images, whose boxes mean nothing."""
     rows, columns = images.present.nonzero().unbind(1)
     height, width = images.images.shape[-2:]
     edges = images.boxes.new_tensor([width, height, width, height])
@@ -71,7 +71,7 @@ def crops_of(images: LabelledImages, whole: bool) -> Crops:
     centre = 0.5 * (boxes[:, :2] + boxes[:, 2:])
     half = 0.5 * MARGIN * size.amax(1, keepdim=True)
     regions = torch.cat([rows[:, None].to(boxes), centre - half, centre + half], 1)
-    # Around the image lies its mean colour: a crop is of what is there minus that, plus that.
+    # The image is surrounded by its mean colour, so the crop is of the image minus the mean, which is then added.
     mean = images.images.mean((2, 3), keepdim=True)
     ratio = max(1, round(float(2.0 * half.median()) / _STORED)) if len(rows) else 1
     pixels = (
@@ -87,16 +87,16 @@ def crops_of(images: LabelledImages, whole: bool) -> Crops:
 @validated
 @dataclass(frozen=True)
 class Augmentation:
-    """Changes of crops at random, so that renders cover what photographs have.
+    """Random changes of crops, so that renders cover the variation of photographs.
 
     Args:
-        roll_deg: largest turn in the image plane either way, in degrees; 180 for cameras held at any roll.
-        exposure: largest change of brightness either way, in stops; contrast and colour change with it. Not where psi
+        roll_deg: largest rotation in the image plane either way, in degrees; 180 for cameras held at any roll.
+        exposure: largest change of brightness either way, in stops; contrast and colour change with it. Not used if psi
             weighs lights.
-        blur: largest part of a crop's detail that is lost.
+        blur: largest fraction of a crop's detail that is lost.
         noise: largest standard deviation of pixel noise.
-        occlusion: part of the crops of which a rectangle is hidden.
-        jitter: largest error of a box's sides, as a part of them.
+        occlusion: fraction of the crops in which a rectangle is hidden.
+        jitter: largest error of a box's sides, as a fraction of the sides.
     """
 
     roll_deg: Annotated[float, Ge(0), Le(180)] = 10.0
@@ -107,7 +107,7 @@ class Augmentation:
     jitter: Annotated[float, Ge(0), Le(0.5)] = 0.08
 
     def __call__(self, crops: Crops, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return what the network sees of the crops, and the numbers of their boxes."""
+        """Return the network's view of the crops, and the numbers of their boxes."""
         n, like = len(crops), crops.pixels
 
         def either(*shape: int) -> Tensor:
@@ -136,19 +136,19 @@ class Augmentation:
         covers = (across[:, None, :] & down[:, :, None] & (u[4] < self.occlusion)[..., None])[:, None]
         other = seen[torch.randperm(n, generator=generator)].flip(
             3
-        )  # of another crop: something, not a colour
+        )  # from another crop: a texture, not a plain colour
         return torch.where(covers.to(seen.device), other, seen)
 
 
 def plain(crops: Crops) -> tuple[Tensor, Tensor]:
-    """Return what the network sees of crops as they are, and the numbers of their boxes."""
+    """Return the network's view of unchanged crops, and the numbers of their boxes."""
     zero = crops.pixels.new_zeros(len(crops))
     seen = _sampled(crops.pixels, zero, zero + 1.0, torch.stack([zero, zero], 1))
     return seen - 0.5, crops.boxes
 
 
 def quarters(crops: Crops) -> Float[Tensor, "n 12"]:
-    """Return the mean colours of the four quarters of what the network sees."""
+    """Return the mean colours of the four quarters of the network's view."""
     return adaptive_avg_pool2d(plain(crops)[0], 2).flatten(1)
 
 
@@ -162,7 +162,7 @@ def _softened(pixels: Float[Tensor, "n 3 side side"]) -> Float[Tensor, "n 3 side
 
 
 def _sampled(pixels: Tensor, roll: Tensor, zoom: Tensor, shift: Tensor) -> Float[Tensor, "n 3 side side"]:
-    """Sample the middle of stored crops, turned, scaled and shifted (in sides of the box)."""
+    """Sample the middle of stored crops, rotated, scaled and shifted (in sides of the box)."""
     if not len(pixels):
         return pixels.new_zeros(0, 3, SIDE, SIDE)
     scale = _SHOWN / MARGIN * zoom

@@ -1,12 +1,12 @@
-"""psi read off a target's labelled boxes, in seconds and without a detector: the estimate by label shift.
+"""psi estimated from a target's labelled boxes by label shift, in seconds and without a detector.
 
     estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
 
-Renders of all bins, from a pool that is rendered once, train a small classifier of bins (``network``) and one by
-the size of boxes alone (``calibration``); both read the target's boxes. Expectation maximisation over their
+Renders of all bins, from a pool that is rendered once, train a small classifier of bins (``network``) and another that
+uses only the size of boxes (``calibration``); both read the target's boxes. Expectation maximisation over their
 calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each bin,
-a test against where psi stands, and a test of fit (``evidence``). ``Estimate.psi`` moves only where both tests allow
-it.
+a test against the present psi, and a test of fit (``evidence``). ``Estimate.psi`` moves only where both tests
+allow it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
 
 Groups = Mapping[str, Mapping[str, Sequence[Sequence[int]]]]
-"""Bins, numbered from 1, that an object's symmetry makes the same, by object and factor."""
+"""Bins, numbered from 1, that an object's symmetry makes equal, by object and factor."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Estimate:
     """The distributions that the target's boxes show.
 
     Attributes:
-        factors: object by object, each factor of psi.
-        psi: where it stands now, with what moves moved.
-        images: that were rendered or composed.
-        seconds: that it took.
-        cpu_seconds: spent, by what: pool, images, network, evidence.
+        factors: each factor of psi, object by object.
+        psi: the present psi, with those factors replaced that move.
+        images: number of images that were rendered or composed.
+        seconds: duration.
+        cpu_seconds: processor seconds by purpose: pool, images, network, evidence.
     """
 
     factors: tuple[FactorEstimate, ...]
@@ -76,15 +76,15 @@ def estimate(
     groups: Groups | None = None,
     whole: bool = False,
 ) -> Estimate:
-    """Read psi off the boxes of ``validation``.
+    """Estimate psi from the boxes of ``validation``.
 
     Args:
-        scene: of pooled renders (``pool_of``), or of fields, of which a pool is rendered
+        scene: a scene of pooled renders (``pool_of``), or of fields, from which a pool is then rendered
             here.
         validation: labelled images of the target.
-        psi: where it stands.
-        settings: how.
-        generator: of everything that is drawn.
+        psi: the present psi.
+        settings: settings of the estimate.
+        generator: the source of all random numbers.
         groups: bins that look the same; None: every bin looks different.
         whole: read whole images instead of boxes, for ``task=classification``.
     """
@@ -98,7 +98,9 @@ def estimate(
     cells = Cells(tuple(f.bins for f in distribution.binned))
     network = BinNetwork.drawn(len(scene.names), cells.count, distribution.lights, generator)
     augmentation = settings.augmentation
-    if distribution.lights:  # they are what differs, and no change of exposure may hide it
+    if (
+        distribution.lights
+    ):  # lights are the difference to be measured, and changes of exposure must not hide it
         augmentation = replace(augmentation, exposure=0.0)
     settings.fitting(training, network, augmentation, generator)
     clock("network")

@@ -17,7 +17,7 @@ Finding = Literal["moves", "stays", "uncertain", "not told apart", "fits no rend
 
 @dataclass(frozen=True)
 class Span:
-    """Probabilities ``p`` with the ends of their intervals, and how far from ``p`` the target's are expected."""
+    """Probabilities ``p`` with the ends of their intervals, and the target's expected distance from ``p``."""
 
     p: tuple[float, ...]
     low: tuple[float, ...]
@@ -26,7 +26,7 @@ class Span:
 
     @staticmethod
     def of(p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], covered: float) -> Span:
-        """Return intervals that cover this part of the draws."""
+        """Return intervals that cover the fraction ``covered`` of the draws."""
         tail = 0.5 * (1.0 - covered)
         low, high = (tuple(drawn.quantile(part, 0).tolist()) for part in (tail, 1.0 - tail))
         doubt = total_variation(drawn, p.expand_as(drawn)).mean()
@@ -39,24 +39,24 @@ class FactorEstimate:
 
     Attributes:
         name: the object.
-        factor: of psi.
-        boxes: that were read.
-        start: probabilities of the bins, or weights of the lights, where psi stands.
-        p: probabilities of the bins, or weights of the lights, most probable.
+        factor: the factor of psi.
+        boxes: number of boxes that were read.
+        start: probabilities of the bins, or weights of the lights, at the present psi.
+        p: most probable probabilities of the bins, or weights of the lights.
         low: lower ends of their intervals.
-        high: upper ends.
-        groups: bins (from 1) that look the same; their parts of a group's probability are psi's.
-        p_value: of the null that the target is where psi stands.
-        strange: probability that a box looks less like the renders than a held-out render does, 0.5 where they look
+        high: upper ends of their intervals.
+        groups: bins (from 1) that look the same; psi decides how a group's probability is divided among them.
+        p_value: p-value of the null hypothesis that the target is at the present psi.
+        strange: probability that a box looks less like the renders than a held-out render does; 0.5 if they look
             alike.
-        accuracy: part of held-out renders whose group of bins is told right; of lights, the part of the guesses'
-            variance that weights explain.
-        finding: whether psi ``moves`` to it; ``stays``, since the target may be where psi stands; or does not move
-            because the estimate is uncertain, renders themselves are not told apart, boxes look like no render, or
-            there are too few.
-        chance: accuracy without looking.
-        doubt: total variation that is expected between the estimate and the target's distribution.
-        converged: whether the search for the mixture ended; it does not where the likelihood is flat.
+        accuracy: fraction of held-out renders whose group of bins is recognised; for lights, the fraction of the
+            guesses' variance that weights explain.
+        finding: whether psi ``moves`` to the estimate; ``stays``, because the target may be at the present psi; or does
+            not move because the estimate is uncertain, renders themselves cannot be told apart, boxes look like no
+            render, or there are too few.
+        chance: accuracy of guessing without looking.
+        doubt: expected total variation between the estimate and the target's distribution.
+        converged: whether the search for the mixture converged; it does not if the likelihood is flat.
     """
 
     name: str
@@ -108,7 +108,7 @@ class FactorEstimate:
 
     @property
     def _largest(self) -> list[tuple[int, ...]]:
-        """The groups that make up most, at most three."""
+        """The largest groups, at most three."""
         ordered = sorted(self.groups, key=lambda group: -_sum(self.p, group))
         shown, total = [], 0.0
         for group in ordered[:3]:
@@ -144,14 +144,14 @@ def _called(group: Sequence[int]) -> str:
 
 @dataclass(frozen=True)
 class Strangeness:
-    """How far features are from those of renders: the Mahalanobis distance to the nearest cell (Lee et al. 2018).
+    """Distance of features from those of renders: the Mahalanobis distance to the nearest cell (Lee et al. 2018).
 
-    What a light explains of features is no distance: it is taken out first, linearly.
+    The part of the features that the light explains does not count as distance: it is removed first, linearly.
 
     Attributes:
-        means: of the features of every cell's renders.
-        precision: inverse of the covariance that all cells have in common.
-        light: by how much features change with the weights of the lights.
+        means: mean features of every cell's renders.
+        precision: inverse of the covariance that all cells share.
+        light: change of the features with the weights of the lights.
     """
 
     means: Float[Tensor, "cells d"]
@@ -165,7 +165,7 @@ class Strangeness:
         weights: Float[Tensor, "n lights"],
         shrinkage: float = 0.1,
     ) -> Strangeness:
-        """Fit means and covariance, which is drawn towards a multiple of the identity by ``shrinkage``."""
+        """Fit means and covariance; ``shrinkage`` draws the latter towards a multiple of the identity."""
         eye = torch.eye(weights.shape[1], dtype=features.dtype)
         light = torch.linalg.solve(weights.T @ weights + 1e-6 * eye, weights.T @ features)
         features = features - weights @ light
@@ -184,7 +184,7 @@ class Strangeness:
     def __call__(
         self, features: Float[Tensor, "n d"], weights: Float[Tensor, "*n lights"]
     ) -> Float[Tensor, "n"]:
-        """Compute the squared distance of each, seen under lights of these weights."""
+        """Compute the squared distance of each sample, seen under lights with these weights."""
         apart = (features - weights @ self.light)[:, None, :] - self.means
         return (apart @ self.precision * apart).sum(-1).amin(-1)
 
@@ -195,10 +195,10 @@ def part_farther(seen: Float[Tensor, "m"], known: Float[Tensor, "n"], frequency:
     Args:
         seen: distances of boxes.
         known: distances of held-out renders.
-        frequency: of each of these, as often as the boxes show its cell; not normalised.
+        frequency: weight of each render, in proportion to how often the boxes show its cell; not normalised.
 
     Returns:
-        0.5 of none.
+        The probability; 0.5 without boxes or renders.
     """
     total = frequency.sum()
     if not len(seen) or not float(total) > 0.0:

@@ -6,8 +6,8 @@ maximum-likelihood p is the fixed point of (Saerens, Latinne and Decaestecker 20
 
     p_c <- mean_n r_n(c),    r_n(c) = p_c q(c | x_n) / sum_d p_d q(d | x_n).
 
-Here p is a product of the factors' distributions, so each factor's is the margin of the r_n, and a Dirichlet prior adds
-``prior`` boxes to every bin.
+Here p is a product of the factors' distributions, so that each factor's is the margin of the r_n, and a Dirichlet prior
+adds ``prior`` boxes to every bin.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class Status(enum.Enum):
 
 @dataclass(frozen=True)
 class Mixed:
-    """The mixture found.
+    """The mixture that was found.
 
     Attributes:
-        p: of every factor.
-        log_likelihood: of the boxes, relative to that of the classifier's constant.
-        status: of the search.
-        steps: taken.
+        p: probabilities of every factor's bins.
+        log_likelihood: log-likelihood of the boxes, up to the classifier's constant.
+        status: how the search ended.
+        steps: number of steps taken.
     """
 
     p: Probabilities
@@ -68,7 +68,7 @@ class Cells:
         return whole
 
     def margins(self, counts: Float[Tensor, "*batch cells"]) -> Probabilities:
-        """Sum up what lies in every bin of each factor."""
+        """Sum up the counts in every bin of each factor."""
         table = counts.unflatten(-1, self.sizes)
         first = counts.ndim - 1
         axes = range(first, first + len(self.sizes))
@@ -94,9 +94,9 @@ def grouped(
     """Merge bins that cannot be told apart.
 
     Args:
-        likelihood: of each box in every cell.
+        likelihood: likelihood of each box in every cell.
         cells: the combinations of bins.
-        within: of every factor, column g the distribution over the bins of group g.
+        within: for every factor, column g is the distribution over the bins of group g.
 
     Returns:
         The likelihood in every combination of groups.
@@ -118,11 +118,12 @@ def maximise(
     """Find the most probable mixture by expectation maximisation from equal probabilities.
 
     Args:
-        likelihood: of each box in every cell, up to a factor for each box; not negative, one above 0 in every box.
+        likelihood: likelihood of each box in every cell, up to a factor for each box; not negative, and positive
+            somewhere for every box.
         cells: the combinations of bins.
-        prior: boxes that the Dirichlet prior adds to every bin.
-        fixed: distributions that are given, by the position of their factor.
-        steps: at most.
+        prior: number of boxes that the Dirichlet prior adds to every bin.
+        fixed: given distributions, by the position of their factor.
+        steps: largest number of steps.
         tolerance: largest change of a probability in the last step.
     """
     like = likelihood.double()
@@ -173,8 +174,8 @@ def posterior(
 ) -> Probabilities:
     """Draw mixtures from their posterior by Gibbs sampling: cells of the boxes given p, then p given their numbers.
 
-    The Dirichlet prior has the parameter ``prior``: given the boxes' cells, p is on average what ``maximise`` makes
-    of them. (With 1 more, whose mode that is, a bin that has nearly all boxes would be drawn too rarely.) Where the
+    The Dirichlet prior has the parameter ``prior``: given the boxes' cells, the mean of p is what ``maximise`` makes of
+    them. (With 1 more, its mode would be that, and a bin with nearly all boxes would be drawn too rarely.) If the
     likelihood is uncertain, its ``samples`` share the chains.
 
     Returns:
@@ -210,20 +211,20 @@ def ratio_test(
     draws: int,
     generator: torch.Generator,
 ) -> float:
-    """Compute the p-value of the null that some factors have given distributions, by parametric bootstrap.
+    """Compute the p-value of the null hypothesis that some factors have given distributions, by parametric bootstrap.
 
-    The statistic is twice the logarithm of the ratio of likelihoods. Under the null it is that of as many boxes of the
-    ``known`` ones, with cells drawn from the null (and for other factors from what fits best under it): what the
-    classifier gets wrong there, it gets wrong here.
+    The statistic is twice the logarithm of the likelihood ratio. Under the null hypothesis it is that of equally many
+    of the ``known`` boxes, with cells drawn from the null (for other factors, from the best fit under it): the
+    classifier's errors are then the same as for the target's boxes.
 
     Args:
-        likelihood: of each box in every cell.
+        likelihood: likelihood of each box in every cell.
         cells: the combinations of bins.
-        null: the distributions that are tested, by the position of their factor.
-        known: boxes of known cells: their likelihoods, and their cells. Every cell has one at least.
+        null: the tested distributions, by the position of their factor.
+        known: likelihoods of boxes of known cells, and these cells; every cell has at least one box.
         prior: see ``maximise``.
-        draws: of the bootstrap; the smallest p-value is 1 / (``draws`` + 1).
-        generator: of all draws.
+        draws: number of bootstrap draws; the smallest p-value is 1 / (``draws`` + 1).
+        generator: the source of all random numbers.
     """
     observed, under = _statistic(likelihood[None], cells, null, prior)
     joint = cells.joint(tuple(own[0] for own in under))

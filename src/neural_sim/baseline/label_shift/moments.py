@@ -1,14 +1,14 @@
-"""Weights of lights from a sample's mean: lights are no mixture of images, so moments are matched (pure functions).
+"""Weights of lights from a sample's mean by matching moments, because lights do not mix images (pure functions).
 
-All images of an object share one light. Guesses y of the weights w are shrunk towards what was seen most: they are no
-estimates, but over held-out renders of known weights their mean is nearly linear, E[y | w] = B w, and the weights are
-those whose mean is the target's (indirect inference, Gourieroux, Monfort and Renault 1993):
+All images of an object share one light. Guesses y of the weights w are shrunk towards the most common renders, and so
+are not estimates themselves; but over held-out renders of known weights their mean is nearly linear, E[y | w] = B w.
+The weights are those at which it equals the target's mean (indirect inference, Gourieroux, Monfort and Renault 1993):
 
     w = argmin (ybar - B w)^T S^-1 (ybar - B w),    S = cov(ybar).
 
-There are two guesses of each weight, the network's and one that is linear in the colours of a crop's quarters, as light
-itself adds up. S says which to believe: where few renders trained the network, the colours. Covariances between
-the two are left out: the one's errors, which are no noise, would correct the other's.
+There are two guesses of each weight: the network's, and one that is linear in the colours of a crop's quarters, as
+light itself is additive. S says which to trust: the colours, if few renders trained the network. Covariances between
+the two are left out: otherwise the systematic errors of one would correct the other.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ Project = Callable[[Float[Tensor, "*n k"]], Float[Tensor, "*n k"]]
 class Response:
     """How guesses depend on weights.
 
-    Attributes:
-        slope: B.
-        scatter: covariance of a guess about B w.
-        precision: inverse of the sum of w w^T over the different renders that B is from.
-        explained: part of the guesses' variance that B w has.
+    slope: B.
+    scatter: covariance of a guess around B w.
+    precision: inverse of the sum of w w^T over the different renders from which B was fitted.
+    explained: fraction of the guesses' variance that B w explains.
     """
 
     slope: Float[Tensor, "m k"]
@@ -49,24 +48,23 @@ class Response:
         lights = weights.shape[1]
         own = torch.arange(guesses.shape[1]) // lights
         scatter = left.T @ left / max(len(left) - lights, 1) * (own[:, None] == own)
-        least = (
-            (0.03 * scatter.diagonal()).clamp_min(1e-12).diag()
-        )  # weights sum to 1, and so do guesses, nearly
-        several = len(weights) / len(weights.unique(dim=0))  # images of one render: they err alike
+        least = (0.03 * scatter.diagonal()).clamp_min(1e-12).diag()  # weights sum to 1, and guesses nearly do
+        several = len(weights) / len(weights.unique(dim=0))  # images of one render, whose errors are alike
         variance = float((guesses - guesses.mean(0)).square().sum())
         explained = 1.0 - float(left.square().sum()) / max(variance, 1e-12)
         return Response(slope, scatter + least, several * precision, explained)
 
     def covariance(self, boxes: int, weights: Float[Tensor, "k"]) -> Float[Tensor, "m m"]:
-        """Compute the covariance of the mean of ``boxes`` guesses less B w, which has errors of its own.
+        """Compute the covariance of the mean of ``boxes`` guesses minus B w, including the error of B.
 
-        The boxes share one light. What the line misses of it is the same in all of them, no number of them averages it
-        out, and renders do not tell it from what differs between boxes: all of the scatter may be that.
+        The boxes share one light. The linear model's error for that light is the same in all of them and does not
+        average out. Renders cannot separate it from differences between boxes, so all of the scatter is assumed to be
+        of that kind.
         """
         return self.scatter * (1.0 + 1.0 / boxes + weights @ self.precision @ weights)
 
     def misfits(self, guesses: Float[Tensor, "n m"], project: Project) -> Float[Tensor, "n"]:
-        """Compute how far each guess is from that of any weights, as in Hansen's test of overidentification."""
+        """Compute the distance of each guess from those of any weights, as in Hansen's test of overidentification."""
         nearest = matched(guesses, self.slope, self.scatter, project)
         return distance(guesses, nearest, self.slope, self.scatter)
 
@@ -77,7 +75,7 @@ def fitted(
     others: Float[Tensor, "m d"],
     ridge: float = 1e-3,
 ) -> Float[Tensor, "m k"]:
-    """Guess the weights of others by what is linear in the inputs, from renders of known weights (ridge regression)."""
+    """Guess weights linearly from inputs, fitted to renders of known weights (ridge regression)."""
     centre, middle = inputs.mean(0), weights.mean(0)
     apart = inputs - centre
     eye = ridge * len(inputs) * apart.square().mean().clamp_min(1e-12) * torch.eye(inputs.shape[1]).to(inputs)
@@ -125,6 +123,6 @@ def distance(
 def scattered(
     mean: Float[Tensor, "m"], covariance: Float[Tensor, "m m"], draws: int, generator: torch.Generator
 ) -> Float[Tensor, "draws m"]:
-    """Draw means from the normal distribution about ``mean``."""
+    """Draw means from the normal distribution around ``mean``."""
     noise = torch.randn(draws, len(mean), generator=generator, dtype=mean.dtype)
     return mean + noise @ torch.linalg.cholesky(covariance).T

@@ -25,7 +25,7 @@ class Known:
     Attributes:
         crops: the crops.
         cells: each one's combination of bins.
-        weights: each one's weights of the lights, without columns where the light is fixed.
+        weights: each one's weights of the lights; no columns if the light is fixed.
     """
 
     crops: Crops
@@ -33,12 +33,12 @@ class Known:
     weights: Float[Tensor, "n lights"]
 
     def select(self, index: Tensor) -> Known:
-        """Select some."""
+        """Select some crops."""
         return Known(self.crops.select(index), self.cells[index], self.weights[index])
 
 
 class PerObject(nn.Module):
-    """A linear layer whose weights are an object's own."""
+    """A linear layer with separate weights for each object."""
 
     def __init__(self, objects: int, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -46,15 +46,15 @@ class PerObject(nn.Module):
         self.bias = nn.Parameter(torch.zeros(objects, outputs))
 
     def forward(self, values: Float[Tensor, "n i"], labels: Int[Tensor, "n"]) -> Float[Tensor, "n o"]:
-        """Apply each crop's object's layer."""
+        """Apply to each crop the layer of its object."""
         return torch.einsum("noi,ni->no", self.weight[labels], values) + self.bias[labels]
 
 
 class BinNetwork(nn.Module):
     """A network from a crop, its box and its object to logits of the cells and weights of the lights.
 
-    Convolutions are common to all objects; each scales and shifts their last features, reads its boxes by a layer of
-    its own and ends in one.
+    All objects share the convolutions; each has its own scale and shift of their last features, its own layer to read
+    its boxes, and its own last layer.
     """
 
     @staticmethod
@@ -89,8 +89,8 @@ class BinNetwork(nn.Module):
         boxes: Float[Tensor, "n numbers"],
         labels: Int[Tensor, "n"],
     ) -> tuple[Float[Tensor, "n cells"], Float[Tensor, "n lights"], Float[Tensor, "n features"]]:
-        """Return logits of the cells, weights of the lights, and the features that they are read from."""
-        if not self.lights:  # a target of another exposure than the renders shows the same bins
+        """Return logits of the cells, weights of the lights, and the features from which both are computed."""
+        if not self.lights:  # exposures that differ from the renders' must not change the bins
             apart = seen - seen.mean((1, 2, 3), keepdim=True)
             seen = apart / (apart.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.01)
         image = self.joined(self.convolutions(seen).flatten(1))
@@ -106,10 +106,10 @@ class Fitting:
     """How the network is trained.
 
     Args:
-        epochs: over all crops.
-        batch_size: crops a step.
-        learning_rate: of Adam at its highest, in one cycle.
-        weight_decay: decoupled.
+        epochs: number of passes over all crops.
+        batch_size: number of crops in a step.
+        learning_rate: peak learning rate of Adam, in one cycle.
+        weight_decay: decoupled weight decay.
     """
 
     epochs: PositiveInt = 12
@@ -150,7 +150,7 @@ class Fitting:
 class Outputs:
     """A network's outputs on crops: logits of the cells, guesses of the lights' weights, features behind both.
 
-    Other guesses than the network's may join these.
+    Guesses from other sources may be added to these.
     """
 
     logits: Float[Tensor, "*guesses n cells"]
@@ -163,7 +163,7 @@ class Outputs:
 
 @torch.no_grad()
 def outputs_of(network: BinNetwork, crops: Crops) -> Outputs:
-    """Apply the network to crops as they are, float64."""
+    """Apply the network to unchanged crops; the result is float64."""
     network.eval()
     seen, boxes = plain(crops)
     rows = torch.arange(len(crops)).split(256)

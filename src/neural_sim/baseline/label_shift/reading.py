@@ -23,25 +23,25 @@ from neural_sim.parameter.product import SceneDistribution
 Bins = Sequence[Sequence[int]]
 """Groups of bins, numbered from 1, that look the same."""
 NEVER = -1e3
-"""The logit of what is never drawn: finite, so that a temperature can be found."""
+"""The logit of a cell that is never drawn: finite, so that a temperature can be found."""
 BEYOND_ALL = 0.995
-"""Largest strangeness where lights alone move: boxes share one, so that they are strange together or not at all."""
+"""Largest strangeness if only lights move: boxes share one light, so that they are strange together or not at all."""
 CALIBRATIONS = 20
-"""Samples of the held-out renders whose calibrations differ as much as this one may err."""
+"""Number of samples of the held-out renders, whose calibrations differ as much as the calibration may err."""
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A trained network, and what it was trained on and is to read.
+    """A trained network, with its training set and what it should read.
 
     Attributes:
-        settings: how.
+        settings: settings of the estimate.
         distribution: p_psi.
         network: the classifier.
-        training: crops that it was trained on.
+        training: crops on which it was trained.
         held: crops of other renders.
-        target: the target's.
-        generator: of everything that is drawn.
+        target: crops of the target.
+        generator: the source of all random numbers.
     """
 
     settings: LabelShift
@@ -55,7 +55,7 @@ class Reader:
     def read(
         self, label: int, name: str, psi: Float[Tensor, "K"], groups: Mapping[str, Bins]
     ) -> tuple[list[FactorEstimate], Float[Tensor, "K"]]:
-        """Return the estimates of an object's factors, and its psi with what moves moved."""
+        """Return the estimates of an object's factors, and its psi with those factors replaced that move."""
         now = self.distribution.split(psi)
         drawn = _drawn(self.distribution, now)
         training, held = (
@@ -64,7 +64,7 @@ class Reader:
         )
         target = self.target.select(self.target.labels == label)
         seen, known = (self._guessed(training, crops, drawn) for crops in (target, held.crops))
-        limits = None  # where no render shows the object
+        limits = None  # no render shows the object
         if len(training.crops) and len(held.crops):
             features = outputs_of(self.network, training.crops).features
             limits = Strangeness.of(features, training.cells, training.weights.double())
@@ -79,7 +79,7 @@ class Reader:
         return found, self.distribution.join(new)
 
     def _guessed(self, training: Known, crops: Crops, drawn: Bool[Tensor, "cells"]) -> Outputs:
-        """Return the network's outputs, with logits by boxes alone and the lights' weights by colours alone."""
+        """Return the network's outputs, and add logits from boxes alone and light weights from colours alone."""
         outputs = outputs_of(self.network, crops)
         logits, weights = [outputs.logits], [outputs.weights]
         if self.distribution.binned and len(training.crops):
@@ -95,7 +95,7 @@ class Reader:
 
 @dataclass(frozen=True)
 class _Read:
-    """A factor as it was read: ``p`` with intervals, by groups of bins, and what speaks for it."""
+    """A factor as it was read: ``p`` with intervals, by groups of bins, and the evidence for it."""
 
     span: Span
     groups: Bins
@@ -107,7 +107,7 @@ class _Read:
 
 @dataclass(frozen=True)
 class _Object:
-    """One object: ``psi`` by factor, what is ``known`` of held-out renders and ``seen`` of the target's boxes."""
+    """One object: ``psi`` by factor, the ``known`` held-out renders, and the target's boxes as ``seen``."""
 
     reader: Reader
     name: str
@@ -136,7 +136,7 @@ class _Object:
     def _strange(
         self, limits: Strangeness, weights: Float[Tensor, "lights"], frequency: Float[Tensor, "held"]
     ) -> float:
-        """Compare the boxes with held-out renders: by features, or where lights alone move, by what weights explain."""
+        """Compare the boxes with held-out renders: by features or, if only lights move, by what weights explain."""
         lights = [f for f in self.reader.distribution.factors if f not in self.reader.distribution.binned]
         if len(lights) == len(self.reader.distribution.factors):
             response = Response.of(self.known.weights, self.held.weights.double())
@@ -171,7 +171,7 @@ class _Object:
         """Read all factors with bins together: boxes are a mixture of their combinations.
 
         Returns:
-            The factors, and how often the boxes show what each held-out render shows.
+            The factors, and how often the boxes show the cell of each held-out render.
         """
         settings, generator = self.reader.settings, self.reader.generator
         factors = self.reader.distribution.binned
@@ -211,7 +211,7 @@ class _Object:
     def _recalibrated(
         self, every: Cells, within: Sequence[Float[Tensor, "_ _"]]
     ) -> Float[Tensor, "samples boxes merged"]:
-        """Compute the boxes' likelihoods by the calibration of several samples of the held-out renders."""
+        """Compute the boxes' likelihoods with the calibration of each sample of the held-out renders."""
         renders, generator = len(self.held.cells), self.reader.generator
         drawn = torch.randint(max(renders, 1), (CALIBRATIONS, renders), generator=generator)
         samples = torch.zeros(CALIBRATIONS, renders).scatter_add_(1, drawn, torch.ones(drawn.shape))
@@ -244,7 +244,7 @@ class _Object:
 
 
 def _drawn(distribution: SceneDistribution, psi: Mapping[str, Tensor]) -> Bool[Tensor, "cells"]:
-    """Select the combinations of bins that are drawn at all: not those that no photograph of the object shows."""
+    """Select the combinations of bins that are drawn at all, without those that no photograph of the object shows."""
     parts = tuple((factor.p_of(psi[factor.name]) > 0.0).double() for factor in distribution.binned)
     if not parts:
         return torch.ones(1, dtype=torch.bool)
@@ -252,13 +252,13 @@ def _drawn(distribution: SceneDistribution, psi: Mapping[str, Tensor]) -> Bool[T
 
 
 def _drawn_groups(p: Float[Tensor, "k"], groups: Bins) -> Bins:
-    """Leave out bins whose probability is 0: their renders are of sides that no photograph shows."""
+    """Leave out bins with probability 0: no photograph shows the side in their renders."""
     left = ([number for number in group if float(p[number - 1]) > 0.0] for group in groups)
     return [group for group in left if group]
 
 
 def _group_of(groups: Bins, bins: int) -> Int[Tensor, "k"]:
-    """Return the position of every bin's group, 0 for those in none."""
+    """Return the position of every bin's group; 0 for bins in none."""
     found = torch.zeros(bins, dtype=torch.long)
     for g, group in enumerate(groups):
         found[torch.tensor(group) - 1] = g
@@ -266,7 +266,7 @@ def _group_of(groups: Bins, bins: int) -> Int[Tensor, "k"]:
 
 
 def _within(p: Float[Tensor, "k"], groups: Bins) -> Float[Tensor, "k g"]:
-    """Return the distribution over the bins of every group, in its column, as ``p`` has it."""
+    """Return the distribution over the bins of every group, one column each, according to ``p``."""
     matrix = torch.zeros(len(p), len(groups), dtype=torch.float64)
     for g, group in enumerate(groups):
         rows = torch.tensor(group) - 1

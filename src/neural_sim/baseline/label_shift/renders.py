@@ -16,14 +16,14 @@ from neural_sim.synthesis.scene import Scene
 
 
 def pool_for(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
-    """Return the scene itself where its renders are pooled, else one of renders of all its bins and lights."""
+    """Return the scene itself if its renders are pooled, else one with renders of all its bins and lights."""
     if all(isinstance(subject, PooledSubject) for subject in scene.subjects):
         return scene
     return pool_of(scene, per_bin, generator, lights=scene.distribution.lights > 0)
 
 
 def parted(pool: Scene, held_out: float) -> tuple[Scene, Scene]:
-    """Part the renders of every cell in those to train on and those held out."""
+    """Divide the renders of every cell into those for training and those held out."""
     sides: tuple[list[PooledSubject], list[PooledSubject]] = ([], [])
     for subject in pool.subjects:
         assert isinstance(subject, PooledSubject)
@@ -46,8 +46,8 @@ def parted(pool: Scene, held_out: float) -> tuple[Scene, Scene]:
 class _Bank:
     """Backgrounds that are drawn once and shown mirrored at random.
 
-    Drawing takes three times as long as all the rest of an image, and a classifier needs other backgrounds for each
-    bin, not for each image.
+    Drawing them takes three times as long as the rest of an image, and a classifier needs different backgrounds for
+    each bin, not for each image.
     """
 
     images: Float[Tensor, "n 3 height width"]
@@ -55,7 +55,7 @@ class _Bank:
     def draw(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
     ) -> Float[Tensor, "n 3 height width"]:
-        """See ``Background``; of the bank's own size alone."""
+        """See ``Background``; only the bank's own size is available."""
         images = self.images[torch.randint(len(self.images), (n,), generator=generator)]
         for axis in (2, 3):
             mirrored = torch.rand((n, 1, 1, 1), generator=generator) < 0.5
@@ -64,7 +64,7 @@ class _Bank:
 
 
 def with_bank(scene: Scene, backgrounds: int, generator: torch.Generator) -> Scene:
-    """Return the scene over ``backgrounds`` that are drawn now."""
+    """Return the scene with ``backgrounds`` backgrounds that are drawn now."""
     own, camera = scene.synthesizer, scene.camera
     images = own.background.draw(backgrounds, camera.height, camera.width, generator)
     return replace(scene, synthesizer=replace(own, background=_Bank(images)))

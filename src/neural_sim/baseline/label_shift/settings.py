@@ -15,26 +15,26 @@ from neural_sim.ranges import Fraction, NonNegative, PositiveFraction, PositiveI
 @validated
 @dataclass(frozen=True)
 class LabelShift:
-    """How psi is read off the target.
+    """How psi is estimated from the target.
 
     Args:
-        per_bin: renders of every bin and object, where the scene has no pool of them yet.
-        held_out: part of the renders that calibrates and tests instead of training.
-        compositions: images that each render is in on average, over other backgrounds.
-        backgrounds: that these images share.
+        per_bin: number of renders of every bin and object, if the scene has no pool of them yet.
+        held_out: fraction of the renders that calibrates and tests instead of training.
+        compositions: average number of images in which each render is shown, over different backgrounds.
+        backgrounds: number of backgrounds that these images share.
         fitting: how the classifier is trained.
-        augmentation: changes of its crops.
-        prior: boxes that the Dirichlet prior adds to every bin.
-        level: of the test against where psi stands; that part of the objects at their target moves by chance.
-        draws: of the test's bootstrap and of the intervals.
-        interval: probability that an interval covers.
-        strange: largest probability that a box may look less like the renders than a held-out render does; above, its
+        augmentation: random changes of its crops.
+        prior: number of boxes that the Dirichlet prior adds to every bin.
+        level: level of the test against the present psi: the fraction of objects at their target that move by chance.
+        draws: number of draws for the test's bootstrap and for the intervals.
+        interval: coverage probability of the intervals.
+        strange: largest probability that a box looks less like the renders than a held-out render does; above it, the
             object's psi does not move.
-        doubt: largest total variation that is expected between an estimate and the target's distribution; above, psi
+        doubt: largest expected total variation between an estimate and the target's distribution; above it, psi
             does not move.
-        skill: smallest accuracy on held-out renders, from 0 of chance to 1; below, psi does not move.
-        fewest: boxes of an object, below which it does not move.
-        name: in reports.
+        skill: smallest accuracy on held-out renders, on a scale from 0 (chance) to 1; below it, psi does not move.
+        fewest: smallest number of boxes of an object at which its psi may move.
+        name: name in reports.
     """
 
     per_bin: PositiveInt = 48
