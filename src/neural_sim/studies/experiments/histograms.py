@@ -23,16 +23,16 @@ class Histogram:
     """One factor of one object at one start.
 
     Args:
-        experiment: of the runs.
-        name: of the object.
-        factor: what is learned of it.
+        experiment: experiment of the runs.
+        name: name of the object.
+        factor: the learned factor.
         start: the initial distribution in short.
-        aim: the target's in short.
-        seeds: of the runs.
-        groups: its bins, from 1, that look the same.
+        aim: the target's distribution in short.
+        seeds: seeds of the runs.
+        groups: bins, from 1, that look the same.
         p: initial, target and learned probabilities.
         distance: mean total variation of initial and learned to the target.
-        commits: of the code of the runs.
+        commits: commits of the runs' code.
     """
 
     experiment: str

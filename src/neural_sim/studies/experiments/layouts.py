@@ -24,7 +24,7 @@ ALONE = {"real_only": "photographs alone", "views_only": "views of the fields al
 
 @dataclass(frozen=True)
 class Shown:
-    """What a layout makes of settings.
+    """The output of a layout for some settings.
 
     Args:
         lines: for the table of all experiments.
@@ -43,11 +43,10 @@ class Shown:
 class Paper:
     """A table of the paper, as conf/paper/numbers.yaml has it.
 
-    Args:
-        title: what the paper calls it.
-        lines: of the paper's LaTeX source.
-        columns: their titles.
-        rows: for each name a number for each column, None where the paper prints none.
+    title: the paper's title.
+    lines: first and last line in the paper's LaTeX source.
+    columns: titles of the columns.
+    rows: for each name a number for each column, None where the paper prints none.
 
     Raises:
         ValueError: a row without a number for each column.

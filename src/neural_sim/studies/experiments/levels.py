@@ -17,7 +17,7 @@ from neural_sim.studies.experiments.settings import Setting, called, modes
 Axis = Literal["gap", "target"]
 STARTS = {"same": "the target's", "uniform": "uniform", "disjoint": "disjoint"}
 COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
-"""Those of the paper's Fig. 5."""
+"""The starts in the paper's Fig. 5."""
 APART = 0.03
 """Distance between methods, in distances between ticks."""
 LABELS = {"gap": "initial distribution", "target": "bins of the target"}
@@ -89,9 +89,9 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
 
 
 def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: float) -> Any:
-    """Draw one method's line, ``aside`` of the ticks so that intervals do not hide each other.
+    """Draw one method's line, shifted from the ticks by ``aside`` so that intervals do not hide each other.
 
-    Settings that it was not run on are gaps in it. Matched has a dash at every setting, which shows a single one too.
+    Settings without a run of it are gaps. Matched has a dash at every setting, so that a single one is visible too.
     """
     found = [setting.score(method, name) if method in setting.table.detectors else None for setting in panel]
     values = 100 * np.asarray([np.nan if each is None else each.value for each in found])

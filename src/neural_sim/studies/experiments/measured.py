@@ -1,4 +1,4 @@
-"""What a page says of measured experiments, kept in a file next to it: runs of several machines fill one page."""
+"""What a page says about measured experiments, kept in a file next to it: runs of several machines fill one page."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Entry:
     """A row of a table of settings, with the commit of its own runs.
 
     Args:
-        place: what it is of, and where it stands in the table: the experiment, then what sorts within it.
+        place: what it is about, and its place in the table: the experiment, then what sorts within it.
         cells: text by column.
-        line: for the table of all experiments; empty: none.
-        commits: of the code of its runs.
+        line: a line for the table of all experiments; empty: none.
+        commits: commits of its runs' code.
     """
 
     place: tuple[str | int, ...]
@@ -33,14 +33,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Measured:
-    """What is known of one experiment.
+    """What is known about one experiment.
 
     Args:
-        lines: for the page's table.
+        lines: lines for the page's table.
         text: Markdown below it.
-        commits: of the runs' code.
+        commits: commits of the runs' code.
         entries: rows of a table above the text, with lines and commits of their own.
-        costs: Markdown below the text, what the methods cost.
+        costs: Markdown below the text about the methods' costs.
     """
 
     lines: Sequence[str]
@@ -56,17 +56,17 @@ class Measured:
 
     @property
     def all_commits(self) -> list[str]:
-        """Those of the runs and of the entries' runs."""
+        """Commits of the runs and of the entries' runs."""
         return sorted({*self.commits, *(commit for entry in self.entries for commit in entry.commits)})
 
     @property
     def cell(self) -> str:
-        """What stands in the page's table."""
+        """The cell in the page's table."""
         return "<br>".join([*self.summary, f"(commit {', '.join(self.all_commits)})"])
 
     @property
     def below(self) -> str:
-        """What stands below the page's table."""
+        """The text below the page's table."""
         parts = (table(self.entries) if self.entries else "", self.text, self.costs)
         return "\n\n".join(part for part in parts if part)
 
@@ -99,7 +99,7 @@ def document_of(page: str) -> Path:
 
 
 def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
-    """Read the rows by name; none where there is no such file, or where it is of another ``budget`` (the scale)."""
+    """Read the rows by name; empty if there is no such file, or if it is for another ``budget`` (the scale)."""
     if not file.is_file():
         return {}
     document = json.loads(file.read_text(encoding="utf-8"))
