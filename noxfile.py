@@ -31,7 +31,9 @@ def tests(session: nox.Session) -> None:
     """Run the fast tests, in up to four processes of one thread."""
     _install(session, many_processes=True)
     session.env["OMP_NUM_THREADS"] = "1"
-    session.run("python", "-m", "pytest", "-n", "auto", "--maxprocesses", "4", *session.posargs)
+    session.run(
+        "python", "-m", "pytest", "-n", "auto", "--maxprocesses", "4", "--dist", "worksteal", *session.posargs
+    )
 
 
 @nox.session

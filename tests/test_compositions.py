@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
@@ -37,8 +37,7 @@ EXPERIMENTS = sorted(
 
 
 def experiment(*overrides):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return build(compose("config", list(overrides)))
+    return build(composed(*overrides))
 
 
 @pytest.mark.parametrize(("baseline", "parameter"), itertools.product(BASELINES, PARAMETERS))

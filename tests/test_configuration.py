@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 from omegaconf import OmegaConf
 
 from neural_sim.configuration import GONE, MOVED, UserError, updated
@@ -75,8 +75,7 @@ def _exists(name):
     key, _, choice = name.partition("=")
     if (conf_directory() / key).is_dir():
         return not choice or (conf_directory() / key / f"{choice}.yaml").is_file()
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = OmegaConf.to_container(compose("config"), resolve=False)
+    config = OmegaConf.to_container(composed(), resolve=False)
     return key in set(_keys(config)) and not choice
 
 
@@ -104,5 +103,4 @@ def test_the_command_line_refuses_what_is_gone():
     ],
 )
 def test_views_of_photographs_are_larger_unless_told(overrides, size):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        assert compose("config", ["scale=quick", *overrides]).views.image_size == size
+    assert composed("scale=quick", *overrides).views.image_size == size

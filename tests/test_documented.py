@@ -8,9 +8,9 @@ import runpy
 from pathlib import Path
 
 import pytest
+from composing import composed
 from documented import FLAGS, PAGES, ROOT, commands, commands_in, nox_sessions, spans
 from documented_data import MadeData, with_given_cameras
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from neural_sim import main as program
@@ -29,8 +29,7 @@ def data(tmp_path_factory):
 @functools.cache
 def compose_and_build(overrides):
     """All parts of what a command would run, from a configuration; refused as the command line refuses."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", list(overrides))
+    config = composed(*overrides)
     context, _ = program.context_of(config, Path("unused"))
     if set(context.stages) & set(PHASES) and config.trainer.accelerator == "cpu":
         assert context.graph.names

@@ -8,20 +8,17 @@ import sys
 
 import pytest
 import torch
+from composing import composed
 from documented import ROOT, commands
 from documented_checks import check_of
 from documented_data import MadeData, with_given_cameras
 from filelock import FileLock
-from hydra import compose, initialize_config_dir
-
-from neural_sim.main import conf_directory
 
 pytestmark = pytest.mark.slow
 
 
 def _configuration(job):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return compose("config", job)
+    return composed(*job)
 
 
 def _compares(command):

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from composing import composed
 from documented import Command
 from documented_data import MadeData, captures
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
@@ -34,11 +34,6 @@ def labels(name, shared):
         root = shared / "captures"
         return [f"objects.root={root if root.is_dir() else captures(root)}", "objects/poses=given"]
     return [given[name]] if name in given else []
-
-
-def composed(*overrides):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides))
 
 
 def made(*overrides):

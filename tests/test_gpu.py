@@ -4,10 +4,10 @@ import json
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 
 from neural_sim import devices
-from neural_sim.main import conf_directory, context_of
+from neural_sim.main import context_of
 from neural_sim.tasks.walk import walk
 
 RUNS = {
@@ -26,8 +26,7 @@ def _results(folder, trainer, overrides):
         "objects.names=[pitcher,drill]",
         *paths,
     ]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        context, others = context_of(compose("config", [*chosen, *overrides]), folder / "run")
+    context, others = context_of(composed(*chosen, *overrides), folder / "run")
     torch.manual_seed(0)  # layers of a field's colour head
     walk(context, others)
     return json.loads((folder / "run" / "results.json").read_text())

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -18,8 +18,7 @@ CONF = Path(conf_directory())
 
 
 def _config(*overrides, hydra=False):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides), return_hydra_config=hydra)
+    return composed(*overrides, hydra=hydra)
 
 
 def _run(folder, *arguments):

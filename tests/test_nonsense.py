@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 from PIL import Image
 
-from neural_sim.main import _instantiate, _plain, conf_directory
+from neural_sim.main import _instantiate, _plain
 from neural_sim.ranges import UserError
 
 FAST = 13
@@ -25,8 +25,7 @@ def groups(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The default configuration's groups, with all parameters and a picture for what wants one."""
     picture = tmp_path_factory.mktemp("pictures") / "a.png"
     Image.new("RGB", (4, 4)).save(picture)
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        plain = _plain(compose("config", ["parameter=[pose,zoom,illumination]", f"predict.images={picture}"]))
+    plain = _plain(composed("parameter=[pose,zoom,illumination]", f"predict.images={picture}"))
     found = {key: node for key, node in plain.items() if isinstance(node, dict) and "_target_" in node}
     return found | {f"parameter.{name}": node for name, node in plain["parameter"].items()}
 

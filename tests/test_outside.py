@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 from PIL import Image
 
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
 from neural_sim.detector.saved import SavedDetector
-from neural_sim.main import UserError, build, conf_directory, context_of
+from neural_sim.main import UserError, build, context_of
 from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.tasks.walk import walk
 
@@ -33,20 +33,19 @@ def on_the_path(monkeypatch):
         sys.modules.pop(path.stem, None)
 
 
-def composed(*overrides):
+def outside(*overrides):
     """As ``python -m src.main --config-dir tests/outside/conf`` composes it."""
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return compose("config", [f"hydra.searchpath=[file://{OUTSIDE / 'conf'}]", "scale=smoke", *overrides])
+    return composed(f"hydra.searchpath=[file://{OUTSIDE / 'conf'}]", "scale=smoke", *overrides)
 
 
 def test_each_is_built_from_its_group():
-    pose = build(composed()).imaging.distribution
-    with_turn = build(composed("parameter=[pose,my_turn]")).imaging.distribution
+    pose = build(outside()).imaging.distribution
+    with_turn = build(outside("parameter=[pose,my_turn]")).imaging.distribution
     assert with_turn.names == ("pose", "turn") and with_turn.size == pose.size + 4
     target = with_turn.probabilities(with_turn.psi("target", ["mug"]))["turn"][0]
     torch.testing.assert_close(target, torch.tensor([0.02, 0.94, 0.02, 0.02], dtype=torch.float64))
-    assert build(composed(MINE["gradient"])).loop.gradient.chunk_size == 8
-    detector = build(composed(MINE["detector"])).detector(num_classes=2, image_size=(32, 48))
+    assert build(outside(MINE["gradient"])).loop.gradient.chunk_size == 8
+    detector = build(outside(MINE["detector"])).detector(num_classes=2, image_size=(32, 48))
     assert len(detector.anchors) == 24
 
 
@@ -61,7 +60,7 @@ def test_each_is_built_from_its_group():
 )
 def test_its_settings_are_checked_like_all_others(override, message):
     with pytest.raises(UserError, match=message):
-        build(composed(*MINE.values(), override))
+        build(outside(*MINE.values(), override))
 
 
 def test_the_pages_example_is_the_detector_that_is_run_here():
@@ -72,7 +71,7 @@ def test_the_pages_example_is_the_detector_that_is_run_here():
 
 
 def test_the_detector_s_boxes_are_those_that_it_was_assigned():
-    detector = build(composed(MINE["detector"])).detector(num_classes=2, image_size=(32, 48))
+    detector = build(outside(MINE["detector"])).detector(num_classes=2, image_size=(32, 48))
     boxes = torch.tensor([[[4.0, 3, 22, 25], [20, 8, 44, 30]]])
     targets = detector.assign(boxes, torch.tensor([[1, 0]]))
     found = targets.labels[0] >= 0
@@ -92,7 +91,7 @@ def test_a_target_is_parted_letterboxed_and_keyed_like_all_others(tmp_path):
     (tmp_path / "boxes.csv").write_text("\n".join(lines))
     table = f"target.table={tmp_path}/boxes.csv"
     words = ["target=my_table", table, "target.val_fraction=0.5", "target.train_fraction=0.5"]
-    config = composed(
+    config = outside(
         *words, "objects.names=[can,mug]", "stages=[target_sets]", "progress=false", "training.image_size=64",
         f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db",
     )  # fmt: skip
@@ -105,12 +104,12 @@ def test_a_target_is_parted_letterboxed_and_keyed_like_all_others(tmp_path):
         assert part.labels.tolist() == [[0]] * len(part)
     assert not graph.renders_target and len(graph.targets.description["target"]["digest"]) == 64
     with pytest.raises(UserError, match=r"target\.val_fraction: want more than 0 and less than 1, got 1\.5"):
-        build(composed(*words, "target.val_fraction=1.5"))
+        build(outside(*words, "target.val_fraction=1.5"))
 
 
 @pytest.mark.parametrize("adjoint", ["implicit", "unrolled"])
 def test_they_run_together(adjoint, tmp_path):
-    config = composed(
+    config = outside(
         *MINE.values(), "objects.names=[can,mug]", "stages=[views,field,target_sets,warm_start,psi,evaluate]",
         f"outer/adjoint={adjoint}", "outer/steps=free", "outer.trust.on_untrusted=keep", "progress=false",
         f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db",
@@ -142,7 +141,7 @@ def test_they_run_together(adjoint, tmp_path):
         f"predict.images={tmp_path}/pictures",
         f"predict.annotations={pictures}",
     ]
-    walk(*context_of(composed("stages=[predict]", "progress=false", *words), tmp_path / "predicted"))
+    walk(*context_of(outside("stages=[predict]", "progress=false", *words), tmp_path / "predicted"))
     assert 0.0 <= json.loads((tmp_path / "predicted" / "scores.json").read_text())["ap"] <= 1.0
 
 
@@ -151,7 +150,7 @@ def test_a_stage_s_result_is_stored_and_its_task_pulls_it(tmp_path):
 
     def brightness(above):
         words = [*paths, "+experiment=my_brightness", f"brightness.above={above}", "progress=false"]
-        context, tasks = context_of(composed(*words), tmp_path)
+        context, tasks = context_of(outside(*words), tmp_path)
         walk(context, tasks)
         return context, json.loads((tmp_path / "brightness.json").read_text())
 
@@ -172,12 +171,12 @@ def test_a_stage_s_result_is_stored_and_its_task_pulls_it(tmp_path):
 def test_a_study_publishes_what_it_found(tmp_path, empty_store, capsys):
     shutil.copy(empty_store, tmp_path / "mlflow.db")
     words = ["+experiment=my_study", f"paths.mlflow={tmp_path}/mlflow.db", "progress=false"]
-    walk(*context_of(composed(*words), tmp_path / "run"))
+    walk(*context_of(outside(*words), tmp_path / "run"))
     found = json.loads((tmp_path / "run" / "distances.json").read_text())
     assert found["pitcher"] > 0.5 and found["can"] == 0.0  # the pitcher's start is biased
     assert "| pitcher | 0." in (tmp_path / "run" / "distances.md").read_text()
     assert (tmp_path / "run" / "figures" / "distances.png").is_file()
     assert "| pitcher | 0." in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"distances\.factor: want one of \['pose'\], got zoom"):
-        walk(*context_of(composed(*words, "distances.factor=zoom"), tmp_path / "none"))
+        walk(*context_of(outside(*words, "distances.factor=zoom"), tmp_path / "none"))
     assert not (tmp_path / "none").exists()

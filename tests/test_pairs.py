@@ -5,8 +5,8 @@ import re
 
 import numpy as np
 import pytest
+from composing import composed
 from documented_data import backgrounds, captures, labels
-from hydra import compose, initialize_config_dir
 
 from neural_sim.configuration import conf_directory
 from neural_sim.main import context_of
@@ -152,12 +152,11 @@ def room(tmp_path_factory):
     return root, Data(root)
 
 
-def composed(room, row):
+def configuration(room, row):
     root, data = room
     words = [word.format_map(data) for choice in row for word in choice.split()]
     paths = [f"paths.store={root / 'store'}", f"paths.mlflow={root / 'mlflow.db'}"]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", [*words, *SMALL, *paths])
+    return composed(*words, *SMALL, *paths)
 
 
 EXAMPLES = [
@@ -176,7 +175,7 @@ EXAMPLES = [
 )
 def test_what_does_not_go_together_is_refused_at_the_start_in_one_line(room, rule, words):
     with pytest.raises(ValueError, match=re.escape(REFUSED[rule][1])) as caught:
-        _ = context_of(composed(room, words), room[0] / "unused")[0].graph.learned
+        _ = context_of(configuration(room, words), room[0] / "unused")[0].graph.learned
     assert "\n" not in str(caught.value)
 
 
@@ -195,7 +194,7 @@ def test_all_other_pairs_run_through(room, part):
         folder = room[0] / f"row_{number}"
         folder.mkdir()
         try:
-            context, tasks = context_of(composed(room, row.values()), folder)
+            context, tasks = context_of(configuration(room, row.values()), folder)
             walk(context, tasks)
             results = context.results(context.graph.learned)
             assert bool(results.last.isfinite().all())

@@ -1,7 +1,7 @@
 """The paper's numbers in conf/paper beside the lines of its LaTeX source that they are from."""
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
@@ -53,8 +53,7 @@ def test_means_of_table_1_are_those_of_its_objects():
 
 
 def test_every_number_is_on_the_page_or_belongs_to_an_experiment_to_come():
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        rows = compose("config", ["+experiment=experiments_table"]).experiments.rows.values()
+    rows = composed("+experiment=experiments_table").experiments.rows.values()
     claimed = {claim for row in rows for claim in row.get("claims", [])}
     assert set(NUMBERS["claims"]) == claimed
     assert set(NUMBERS["tables"]) == {row.table for row in rows if row.get("table")}

@@ -4,9 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 
-from neural_sim.main import build, conf_directory
+from neural_sim.main import build
 
 LEARNED = {"pose_gap": "pose", "zoom_gap": "zoom", "illumination_gap": "illumination"}
 EVERY = tuple(LEARNED)
@@ -66,11 +66,6 @@ PAPER = [
     ("target.test_per_object", 100, EVERY, 852, "The test set has 2100 images (100 images per object)"),
     ("target.test_per_biased_object", 100, EVERY, *HUNDRED),
 ]  # fmt: skip
-
-
-def composed(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return compose("config", list(overrides))
 
 
 @pytest.fixture(scope="module")

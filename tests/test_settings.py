@@ -14,7 +14,7 @@ from typing import Any, Literal, Union
 import hydra
 import pytest
 from annotated_types import Ge, Gt, Le, Lt, MinLen
-from hydra import compose, initialize_config_dir
+from composing import composed
 from omegaconf import OmegaConf
 
 from neural_sim.main import conf_directory
@@ -36,19 +36,18 @@ CHOICES = sorted(
 
 def _compositions():
     """The default configuration, then each choice of every group in it: with interpolations, and without."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        base = compose("config")
-        yield OmegaConf.to_container(base), OmegaConf.to_container(base, resolve=True)
-        for choice in CHOICES:
-            if "override /" in (CONF / f"{choice}.yaml").read_text():
-                group = compose("config", [choice.replace("/", "=")])
-                yield OmegaConf.to_container(group), OmegaConf.to_container(group, resolve=True)
-                continue
-            group = compose(choice)  # alone, which is much faster
-            whole = {name: node for name, node in base.items_ex(resolve=False) if name not in group}
-            made = OmegaConf.merge(whole, group)
-            raw, plain = OmegaConf.to_container(made), OmegaConf.to_container(made, resolve=True)
-            yield {name: raw[name] for name in group}, {name: plain[name] for name in group}
+    base = composed()
+    yield OmegaConf.to_container(base), OmegaConf.to_container(base, resolve=True)
+    for choice in CHOICES:
+        if "override /" in (CONF / f"{choice}.yaml").read_text():
+            group = composed(choice.replace("/", "="))
+            yield OmegaConf.to_container(group), OmegaConf.to_container(group, resolve=True)
+            continue
+        group = compose(choice)  # alone, which is much faster
+        whole = {name: node for name, node in base.items_ex(resolve=False) if name not in group}
+        made = OmegaConf.merge(whole, group)
+        raw, plain = OmegaConf.to_container(made), OmegaConf.to_container(made, resolve=True)
+        yield {name: raw[name] for name in group}, {name: plain[name] for name in group}
 
 
 def nodes(raw, plain):

@@ -7,20 +7,19 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 from made_photographs import photographs_by_class
 
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
-from neural_sim.main import UserError, build, conf_directory
+from neural_sim.main import UserError, build
 from neural_sim.outer.objective import Loss
 
 ROOT = Path(__file__).parents[1]
 
 
 def made(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return build(compose("config", list(overrides)))
+    return build(composed(*overrides))
 
 
 def _run(folder, *arguments):

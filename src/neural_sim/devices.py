@@ -67,7 +67,7 @@ class Resident(SingleDeviceStrategy):
         return
 
 
-def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False) -> Trainer:
+def trainer_on(device: torch.device, max_epochs: int = 1) -> Trainer:
     """Make a Trainer for modules that lie on ``device``, with everything off that writes files or talks.
 
     It leaves signals to ``interruption``: under SLURM it would otherwise ignore SIGTERM and requeue the job itself.
@@ -81,7 +81,7 @@ def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False
         max_epochs=max_epochs,
         logger=False,
         enable_checkpointing=False,
-        enable_progress_bar=progress,
+        enable_progress_bar=False,
         enable_model_summary=False,
     )
 

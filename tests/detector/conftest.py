@@ -2,12 +2,11 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 from hydra.utils import instantiate
 
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head, Losses
-from neural_sim.main import conf_directory
 from neural_sim.types import LabelledImages
 
 CLASSES = 3
@@ -71,8 +70,7 @@ def mean_loss(detector: RetinaNet, params: dict[str, torch.Tensor], images: Labe
 
 def configured(name: str):
     """A choice of ``detector=...``, still without classes and image size."""
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return instantiate(compose("config", [f"detector={name}"]).detector)
+    return instantiate(composed(f"detector={name}").detector)
 
 
 @pytest.fixture

@@ -1,16 +1,15 @@
 """What the command line makes of the pathwise estimator's choices, each one override away."""
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.main import UserError, build, conf_directory
+from neural_sim.main import UserError, build
 from neural_sim.parameter.product import RelaxedDraws
 
 
 def experiment(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return build(compose("config", list(overrides)))
+    return build(composed(*overrides))
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def interrupted(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(InnerLoop, "train", counted)
             with pytest.raises(Killed):
-                learn_psi(make(), False, checkpoint=checkpoint())
+                learn_psi(make(), checkpoint=checkpoint())
 
     return run, checkpoint
 
@@ -90,14 +90,14 @@ LOOPS = {
 def test_a_loop_that_was_killed_ends_at_the_same_bits(scene, interrupted, kind, caplog):
     run, checkpoint = interrupted
     make, seen = lambda: LOOPS[kind](scene), []
-    whole = _bits(learn_psi(make(), False))
+    whole = _bits(learn_psi(make()))
     run(make, {"response": 14, "paper": 1}.get(kind, 3))  # some iterations have ended
     done = len(checkpoint().read()["records"])
     assert 0 < done < len(whole[0]) - 1
     run(make, 0)  # and once more, in the middle of the next one
     assert len(checkpoint().read()["records"]) == done
     with caplog.at_level(logging.INFO):
-        learned = learn_psi(make(), False, seen.append, checkpoint())
+        learned = learn_psi(make(), seen.append, checkpoint())
     assert _bits(learned) == whole
     assert seen == learned.records  # what watches the run sees all iterations
     assert f"resumes after round {done}" in caplog.text
@@ -109,15 +109,15 @@ def test_a_method_of_rewards_that_was_killed_ends_at_the_same_bits(reward_loop, 
     def make():
         return reward_loop(LearningToSimulate(rounds=3, samples=2))
 
-    whole = _bits(learn_psi(make(), False))
+    whole = _bits(learn_psi(make()))
     for done in (3, 2):  # in the middle of a step's two settings, and after them
         run(make, done)
     assert len(checkpoint().read()["records"]) == 5
-    assert _bits(learn_psi(make(), False, checkpoint=checkpoint())) == whole
+    assert _bits(learn_psi(make(), checkpoint=checkpoint())) == whole
 
 
 def test_a_loop_that_had_ended_is_not_run_again(scene, interrupted, monkeypatch):
     _, checkpoint = interrupted
-    whole = _bits(learn_psi(LOOPS["paper"](scene), False, checkpoint=checkpoint()))
+    whole = _bits(learn_psi(LOOPS["paper"](scene), checkpoint=checkpoint()))
     monkeypatch.setattr(InnerLoop, "train", lambda *_: pytest.fail("trained again"))
-    assert _bits(learn_psi(LOOPS["paper"](scene), False, checkpoint=checkpoint())) == whole
+    assert _bits(learn_psi(LOOPS["paper"](scene), checkpoint=checkpoint())) == whole

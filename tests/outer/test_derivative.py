@@ -58,7 +58,7 @@ def _module(scene, estimator, psi=None, **outer):
 def test_every_estimator_moves_psi_through_the_training(scene, estimator):
     joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
     module = _module(dataclasses.replace(scene, distribution=joint), estimator, torch.zeros(2, 5))
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert len(learned.records) == 2
     for record in learned.records:
         # Two epochs of 12 images in batches of 4, each step walked back through.
@@ -69,13 +69,13 @@ def test_every_estimator_moves_psi_through_the_training(scene, estimator):
 
 
 def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
-    runs = [learn_psi(_module(scene, StratifiedEstimator(probes_per_bin=2)), False).last for _ in range(2)]
+    runs = [learn_psi(_module(scene, StratifiedEstimator(probes_per_bin=2))).last for _ in range(2)]
     assert torch.equal(*runs)
 
 
 def test_objects_that_are_not_learned_are_not_scored(scene):
     module = _module(scene, StratifiedEstimator(probes_per_bin=2), learned=("b",))
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert not learned.last[0].any() and learned.last[1].any()
 
 
@@ -161,7 +161,7 @@ def test_detectors_of_other_kinds_go_through_the_same_loop(scene, adjoint, kind,
     inputs = LoopInputs(detector, params, scene.training_set(psi, 3, generator).images)
     inner = InnerLoop.prepare(scene, inputs, settings, Training(batch_size=4), generator, estimator.draws)
     module = SimulatorModule(inner, psi, estimator, AdjointSolver(), generator)
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     norms = torch.tensor(learned.records[0].gradient_norms)
     assert len(learned.records) == 2 and bool(norms.isfinite().all()) and bool(norms.any())
     assert bool(module.psi.isfinite().all()) and learned.records[1].verdicts

@@ -57,7 +57,7 @@ def test_methods_that_are_not_checked_get_new_random_numbers(scene):
 
 def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
     module = checked_loop(scene)
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     first, middle, last = learned.records
     assert first.verdicts == {} and first.certificate and middle.certificate
     # The last training judges and takes no derivative.
@@ -80,7 +80,7 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
 
 
 def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
-    learned = learn_psi(checked_loop(scene, steps=replace(EVERY_STEP, waits_below=1.0)), progress=False)
+    learned = learn_psi(checked_loop(scene, steps=replace(EVERY_STEP, waits_below=1.0)))
     first, second, _ = learned.records
     assert first.certificate
     actions = {name: by_factor["pose"] for name, by_factor in first.certificate.actions.items()}
@@ -98,7 +98,7 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
         return train_on(psi, recording)
 
     module.train_on = noted
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     trained = [(numbers.index, recording is not None) for _, (_, numbers, _, recording), _ in calls]
     # Two derivatives before the first step; then a verdict and a derivative an iteration; then a verdict.
     assert trained == [(0, True), (1, True), (1, False), (2, True), (2, False)]
@@ -115,7 +115,7 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
 def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene, monkeypatch):
     module = checked_loop(scene, 4, steps=replace(EVERY_STEP, trainings=2))
     calls = watch(monkeypatch, SimulatorModule, "_derivative")
-    learn_psi(module, progress=False)
+    learn_psi(module)
     seen = [objective.images.images for _, (_, objective), _ in calls]
     assert [len(part) for part in seen] == [3] * 4
     for first, second in (seen[:2], seen[2:]):
@@ -128,7 +128,7 @@ def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(sc
 def test_a_certified_derivative_is_of_all_validation_images_as_its_reference_is(scene, monkeypatch):
     module = checked_loop(scene, 3, steps=replace(EVERY_STEP, trainings=2), certify_every=2)
     calls = watch(monkeypatch, SimulatorModule, "_derivative")
-    learn_psi(module, progress=False)
+    learn_psi(module)
     assert [len(objective.images) for _, (_, objective), _ in calls] == [3, 3, 6]
 
 
@@ -137,7 +137,7 @@ def test_a_loop_whose_steps_never_help_ends_where_it_began(scene, monkeypatch):
     falling = iter(range(10))
     scores = property(lambda trained: torch.full((2, 6), -float(next(falling))))
     monkeypatch.setattr(Trained, "scores", scores)
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert any(record.verdicts for record in learned.records)
     assert not any(v.accepted for record in learned.records for v in record.verdicts.values())
     assert torch.equal(learned.last, learned.trajectory[0])
@@ -152,11 +152,11 @@ def test_checked_steps_want_trainings_that_can_be_compared(scene, bad):
 def test_objects_that_validation_does_not_show_keep_their_psi(scene, caplog):
     module = checked_loop(scene, shown=slice(3, 6))
     assert "no validation image shows: a" in caplog.text
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert not learned.last[0].any() and set(learned.records[1].verdicts) == {"b"}
     assert all(set(record.certificate.actions) == {"b"} for record in learned.records[:2])
     both = checked_loop(scene, shown=slice(3, 6), learned=("a", "b"))
-    assert set(learn_psi(both, progress=False).records[1].verdicts) == {"a", "b"}
+    assert set(learn_psi(both).records[1].verdicts) == {"a", "b"}
 
 
 def test_validation_without_an_object_is_refused(scene):
@@ -210,7 +210,7 @@ def test_the_first_step_is_judged_by_a_training_object_by_object(scene, monkeypa
         return train_on(psi, recording)
 
     module.train_on = noted
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     (drawn_from, images, psi), record = first.given[0], learned.records[0]
     assert len(first.given) == 1 and drawn_from is module.inner.pool and not psi.any()
     assert images is module.inner.objective.images
@@ -227,13 +227,13 @@ def test_the_first_step_is_judged_by_a_training_object_by_object(scene, monkeypa
 
 
 def test_a_first_step_that_is_wrong_is_taken_back_and_the_loop_goes_on(scene, monkeypatch):
-    plain = learn_psi(checked_loop(scene), progress=False)
+    plain = learn_psi(checked_loop(scene))
     wrong = checked_loop(scene, first=Fake(THERE))
     original = Trained.scores
     monkeypatch.setattr(
         Trained, "scores", property(lambda t: original.fget(t) - float(t.psi.abs().max() == 3.0))
     )
-    learned = learn_psi(wrong, progress=False)
+    learned = learn_psi(wrong)
     assert not any(verdict.accepted for verdict in learned.records[0].verdicts.values())
     assert learned.records[0].certificate and learned.records[1].verdicts
     assert len(learned.records) == len(plain.records)
@@ -242,7 +242,7 @@ def test_a_first_step_that_is_wrong_is_taken_back_and_the_loop_goes_on(scene, mo
 
 def test_a_first_step_that_finds_nothing_costs_no_training(scene):
     plain, module = (checked_loop(scene, 2, **more) for more in ({}, {"first": Fake(torch.zeros(2, 4))}))
-    one, other = (learn_psi(loop, progress=False) for loop in (plain, module))
+    one, other = (learn_psi(loop) for loop in (plain, module))
     assert [r.detector_steps for r in one.records] == [r.detector_steps for r in other.records]
     assert other.records[0].verdicts == {} and other.shown == SHOWN
     assert torch.equal(one.last, other.last)
@@ -251,7 +251,7 @@ def test_a_first_step_that_finds_nothing_costs_no_training(scene):
 def test_one_iteration_takes_the_first_step_alone(scene, monkeypatch):
     module = checked_loop(scene, 1, first=Fake(THERE))
     scored_by(monkeypatch, lambda psi: torch.stack([psi[0, 0], psi[1, 1]]))
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert torch.equal(learned.last, THERE.double()) and learned.records[0].certificate is None
 
 
@@ -274,7 +274,7 @@ def test_a_loop_returns_the_best_psi_on_the_way(scene, monkeypatch):
     monkeypatch.setattr(
         Trained, "scores", property(lambda t: torch.full((2, 6), score(t) / 6, dtype=torch.float64))
     )
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     taken = learned.records[-1].taken_back
     assert set(taken) == {"a", "b"} and all(back.kept == 0 < back.accepted for back in taken.values())
     assert torch.equal(learned.last, learned.trajectory[0])

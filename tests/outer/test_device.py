@@ -69,7 +69,7 @@ def test_the_loop_is_the_cpus(scene, pretend, monkeypatch, estimator):
     found = []
     for device in ("cpu", "pretend"):
         module = _module(scene, estimator, device)
-        found.append(learn_psi(module, progress=False))
+        found.append(learn_psi(module))
         assert {value.device.type for value in module.theta.values()} == {device}
         assert module.psi.device.type == "cpu"
     # Up to the rounding of second derivatives, which the device takes by formulas where the CPU has kernels.
@@ -84,7 +84,7 @@ def test_the_loop_on_the_trainings_derivative_is_the_cpus(scene, pretend, monkey
     found = []
     for device in ("cpu", "pretend"):
         module = _module(scene, estimator, device, epochs=2, adjoint=Unrolled(), train_first=True)
-        found.append(learn_psi(module, progress=False))
+        found.append(learn_psi(module))
         assert next(iter(module.theta.values())).device.type == device
     assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
 
@@ -147,7 +147,7 @@ def test_the_checked_loop_of_average_precision_is_the_cpus(scene, pretend, monke
     found = []
     for device in ("cpu", "pretend"):
         module = _module(scene, StratifiedEstimator(probes_per_bin=1), device, epochs=2, **CHECKED)
-        found.append(learn_psi(module, progress=False))
+        found.append(learn_psi(module))
     assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
     scores = [[record.scores for record in learned.records] for learned in found]
     assert scores[1][0] == pytest.approx(scores[0][0], rel=1e-4)

@@ -62,7 +62,7 @@ def test_a_loop_tries_what_the_boxes_show_and_reports_it(scene):
     module = small_loop(
         scene, StratifiedEstimator(probes_per_bin=2), 2, pool_per_bin=8, first=first, **CHECKED
     )
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert [one.name for one in learned.shown] == ["a", "b"]
     assert set(learned.records[0].verdicts) == {"a", "b"} and "first_step" in learned.records[0].seconds
 
@@ -70,13 +70,13 @@ def test_a_loop_tries_what_the_boxes_show_and_reports_it(scene):
 def test_a_target_that_looks_like_no_render_is_not_believed_and_the_loop_goes_on_as_without(scene):
     """The target's colours are inverted: a wrong estimate, with certainty, were it not for the test of fit."""
     estimator, common = StratifiedEstimator(probes_per_bin=2), {"pool_per_bin": 8, **CHECKED}
-    plain = learn_psi(small_loop(scene, estimator, 2, **common), progress=False)
+    plain = learn_psi(small_loop(scene, estimator, 2, **common))
     strict = replace(QUICK, compositions=4, level=1.0, strange=LabelShift().strange)
     module = small_loop(scene, estimator, 2, first=WhatTheTargetShows(strict), **common)
     images = module.inner.objective.images
     inverted = replace(images, images=1.0 - images.images)
     module.inner = replace(module.inner, objective=replace(module.inner.objective, images=inverted))
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert {one.finding for one in learned.shown} == {"fits no render"}
     assert not learned.records[0].verdicts and learned.records[1].verdicts
     assert torch.equal(learned.last, plain.last)

@@ -165,7 +165,7 @@ def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estim
     inner = InnerLoop.prepare(scene, inputs, settings, training, generator, estimator.draws)
     assert inner.pool is None  # a light that moves makes stored images stale
     module = SimulatorModule(inner, start, estimator, AdjointSolver(max_steps=4), generator)
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     parts = scene.distribution.split(learned.last)
     assert (parts["pose"].abs().amax(-1) > 0.0).all()
     weights = parts["illumination"]

@@ -12,7 +12,7 @@ from neural_sim.outer.loop import learn_psi
 def test_rounds_are_counted_and_the_trajectory_is_the_methods(reward_loop):
     method = LearningToSimulate(rounds=3, samples=2)
     loop = reward_loop(method)
-    learned = learn_psi(loop, progress=False)
+    learned = learn_psi(loop)
     assert len(learned.records) == 2 * method.rounds and len(learned.trajectory) == len(learned.records) + 1
     for record in learned.records:
         assert (record.images, record.detector_steps, record.products) == (12, 3, 0)
@@ -32,6 +32,6 @@ def test_an_observer_sees_each_iteration_when_it_has_ended_at_no_cost_of_the_met
         clock[0] += 100.0
 
     monkeypatch.setattr("neural_sim.outer.loop.time", SimpleNamespace(process_time=lambda: clock[0]))
-    learned = learn_psi(loop, progress=False, on_record=observe)
+    learned = learn_psi(loop, on_record=observe)
     assert seen == [(record, i + 1, i + 2) for i, record in enumerate(learned.records)] and len(seen) == 4
     assert [record.cpu_seconds for record in learned.records[1:]] == [0.0] * 3

@@ -36,7 +36,7 @@ ESTIMATORS = [
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
 def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     module = small_loop(scene, estimator)
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert len(learned.records) == 2
     first = learned.records[0]
     assert first.probabilities["pose"] == [[0.25] * 4] * 2
@@ -54,7 +54,7 @@ def test_the_first_hypergradient_is_taken_at_the_warm_start_unless_it_trains_fir
     module = small_loop(scene, StratifiedEstimator(probes_per_bin=2), start=start, train_first=train_first)
     warm, objective = module.inner.warm_start, module.inner.objective
     at_warm_start = float(objective.of_outputs(objective.outputs(warm)))
-    first, second = learn_psi(module, progress=False).records
+    first, second = learn_psi(module).records
     batches = 12 // 4
     assert (first.detector_steps, second.detector_steps) == (batches * train_first, batches)
     assert (first.validation_loss == at_warm_start) is not train_first
@@ -62,14 +62,14 @@ def test_the_first_hypergradient_is_taken_at_the_warm_start_unless_it_trains_fir
 
 
 def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
-    runs = [learn_psi(small_loop(scene, StratifiedEstimator(probes_per_bin=2)), False).last for _ in range(2)]
+    runs = [learn_psi(small_loop(scene, StratifiedEstimator(probes_per_bin=2))).last for _ in range(2)]
     assert torch.equal(*runs)
 
 
 def test_the_backbone_stays_frozen(scene):
     module = small_loop(scene, ReinforceEstimator())
     before = {name: value.clone() for name, value in module.inner.detector.split(module.theta)[0].items()}
-    learn_psi(module, False)
+    learn_psi(module)
     after = module.inner.detector.split(module.theta)[0]
     assert all(torch.equal(before[name], after[name]) for name in before)
 
@@ -179,7 +179,7 @@ def test_every_factor_of_a_product_is_learned(scene, estimator):
     module = small_loop(
         scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2, steps=FreeSteps(Mirror(shrink=False))
     )
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert set(learned.records[0].probabilities) == {"pose", "zoom"}
     certificate = learned.records[0].certificate
     for name in ("a", "b"):

@@ -91,7 +91,7 @@ def test_a_training_set_is_the_drawn_images_and_then_the_photographs(scene):
 @pytest.mark.parametrize("batch_fraction", [0.5, None])
 def test_every_estimator_moves_psi(scene, estimator, adjoint, batch_fraction):
     made = module(scene, estimator, real=Real("combined", batch_fraction=batch_fraction), adjoint=adjoint)
-    learned = learn_psi(made, progress=False)
+    learned = learn_psi(made)
     # Two epochs of 12 drawn images in batches of 4, or of 17 images where photographs are images like others.
     assert [record.detector_steps for record in learned.records] == [6 if batch_fraction else 10] * 2
     assert [record.images for record in learned.records][1] <= 12 + 2 * 2 * 4  # photographs are not rendered
@@ -163,7 +163,7 @@ def test_methods_that_see_rewards_train_on_them_too(scene):
         inner, generator = inner_loop(
             scene, ReinforceEstimator().draws, photographs=photographs, iterations=1
         )
-        learned = learn_psi(RewardLoop(inner, torch.zeros(2, 4), method, generator), progress=False)
+        learned = learn_psi(RewardLoop(inner, torch.zeros(2, 4), method, generator))
         losses.append(learned.records[0].training_loss)
     assert losses[0] != losses[1]
 
@@ -174,4 +174,4 @@ def test_checked_steps_compare_trainings_on_the_same_photographs(scene):
     made = module(scene, estimator, steps=TrustRegion(), objective=SmoothAP())
     one, other = (made.train_on(torch.zeros(2, 4)).trainable for _ in range(2))
     assert all(torch.equal(one[name], other[name]) for name in one)
-    assert len(learn_psi(made, progress=False).records) == 2
+    assert len(learn_psi(made).records) == 2

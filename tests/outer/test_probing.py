@@ -141,7 +141,7 @@ def test_objects_whose_psi_is_fixed_get_no_probes_and_do_not_move(scene):
     inner = InnerLoop.prepare(two, inputs, settings, training, generator)
     estimator, solver = StratifiedEstimator(probes_per_bin=2), AdjointSolver(max_steps=2)
     module = SimulatorModule(inner, psi, estimator, solver, generator)
-    learned = learn_psi(module, progress=False)
+    learned = learn_psi(module)
     assert module._probes is not None and not module._probes.probes[0] and module._probes.probes[1]
     assert not learned.last[0].any() and learned.last[1].any()
     assert [record.images for record in learned.records] == [4 + 8, 4 + 4]

@@ -99,7 +99,7 @@ def test_its_loop_climbs_to_the_best_bins(scene):
     module = small_loop(scene, StratifiedEstimator(probes_per_bin=2), iterations=6, pool_per_bin=2, **CHECKED)
     inner = linear(module.inner, torch.eye(4, dtype=torch.float64)[[2, 1]])
     loop = ResponseLoop(inner, PSI, 0.15, module.numbers.generator)
-    learned = learn_psi(loop, progress=False)
+    learned = learn_psi(loop)
     p = scene.distribution.probabilities(learned.last)["pose"]
     assert p.argmax(1).tolist() == [2, 1] and float(p.amax(1).min()) > 0.9
     assert all(
@@ -112,7 +112,7 @@ def test_the_loop_compares_its_derivative_with_it_every_so_often(scene):
     estimator = StratifiedEstimator(probes_per_bin=2)
     loop = small_loop(scene, estimator, iterations=3, pool_per_bin=2, certify_every=2, **CHECKED)
     assert isinstance(loop, SimulatorModule)
-    records = learn_psi(loop, progress=False).records
+    records = learn_psi(loop).records
     assert records[0].certificate.cosine is None and -1.0 <= records[1].certificate.cosine <= 1.0
 
 

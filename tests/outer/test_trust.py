@@ -37,8 +37,8 @@ def test_untrusted_steps_are_skipped_stop_the_loop_are_shrunk_or_kept(scene, act
         assert not learned.last.any()
         return
     settings = {"adjoint": NOTHING_WILL_DO, "trust": Trust(on_untrusted=action)}
-    one = learn_psi(small_loop(scene, estimator, 1, detector=MICRO, **settings), False).last
-    free = learn_psi(small_loop(scene, estimator, 1, detector=MICRO, trust=Trust(level=None)), False).last
+    one = learn_psi(small_loop(scene, estimator, 1, detector=MICRO, **settings)).last
+    free = learn_psi(small_loop(scene, estimator, 1, detector=MICRO, trust=Trust(level=None))).last
     torch.testing.assert_close(one, (0.25 if action == "shrink" else 1.0) * free)
 
 
@@ -62,7 +62,7 @@ def test_a_step_without_signal_is_cut_for_its_object_and_factor_alone(scene, on_
     scene = dataclasses.replace(scene, distribution=SceneDistribution.of([Pose(bins=3), Zoom(bins=2)]))
     psi = torch.zeros(2, 5)
     free, cut = (
-        learn_psi(small_loop(scene, Told(), 2, detector=MICRO, psi=psi, **settings), False)
+        learn_psi(small_loop(scene, Told(), 2, detector=MICRO, psi=psi, **settings))
         for settings in ({"trust": Trust(level=None)}, {"trust": Trust(on_untrusted=on_untrusted)})
     )
     assert [record.certificate.doubts for record in cut.records] == [[], []]
@@ -81,8 +81,7 @@ def test_a_step_without_signal_is_cut_for_its_object_and_factor_alone(scene, on_
 )
 def test_a_step_is_certified_by_the_response_without_changing_the_run(scene, estimator):
     plain, certified = (
-        learn_psi(small_loop(scene, estimator, 2, detector=MICRO, certify_every=every), False)
-        for every in (0, 2)
+        learn_psi(small_loop(scene, estimator, 2, detector=MICRO, certify_every=every)) for every in (0, 2)
     )
     first, second = (record.certificate for record in certified.records)
     assert first.cosine is None and -1.0 <= second.cosine <= 1.0
@@ -101,6 +100,6 @@ def test_the_proximal_problem_runs_in_the_loop(scene):
         {**MICRO, "proximal": PROXIMAL},
         learning_rate=0.0,
     )
-    certificate = learn_psi(module, False).records[0].certificate
+    certificate = learn_psi(module).records[0].certificate
     adjoint = certificate.adjoint
     assert adjoint.solver_status == "CONVERGED" and adjoint.damping == 0.0 and adjoint.sensitivity == 0.0

@@ -2,18 +2,17 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.appearance_fitting import AppearanceFitting
 from neural_sim.field.grid import GridField
-from neural_sim.main import UserError, build, conf_directory
+from neural_sim.main import UserError, build
 from neural_sim.renderer.nerf_w import NerfWRenderer
 
 
 def experiment(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return build(compose("config", list(overrides)))
+    return build(composed(*overrides))
 
 
 def test_nerf_w_brings_varied_light_and_fields_with_codes():

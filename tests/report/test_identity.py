@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 from omegaconf import OmegaConf
 
-from neural_sim.main import conf_directory
 from neural_sim.report.identity import all_values, differences, headings, identity, scored_values
 from neural_sim.types import LabelledImages
 
@@ -14,8 +13,7 @@ FILES = {"objects": {"pitcher": "1" * 64, "drill": "2" * 64}}
 
 
 def config(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+    return OmegaConf.to_container(composed(*overrides), resolve=True)
 
 
 def images(value=0.5, edge=4.0, label=0):

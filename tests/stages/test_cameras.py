@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from captures import capture
-from hydra import compose, initialize_config_dir
+from composing import composed
 
 from neural_sim.configuration import updated
-from neural_sim.main import conf_directory, context_of
+from neural_sim.main import context_of
 from neural_sim.objects.capture import Capture
 from neural_sim.objects.found import FoundCapture
 from neural_sim.objects.motion import Colmap
@@ -93,12 +93,11 @@ def test_the_command_line_asks_for_them(alone, tmp_path, monkeypatch):
     assert words == ["objects/poses=colmap", "objects.refinement.rounds=3", "objects.poses.features=900"]
     assert len(notes) == 2
     where = [f"objects.root={alone}", f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db"]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose("config", ["objects=photos", "scale=smoke", "stages=[views]", *words, *where])
-        monkeypatch.setattr(Colmap, "find", lambda self, *more: Known().find(*more))
-        stage = context_of(config, tmp_path)[0].graph.views[0]
-        assert stage.refinement.rounds == 3 and stage.objects.source.poses == Colmap(features=900)
-        assert len(stage.objects.source.captures["can"].frames) == 11
-        given = compose("config", ["objects=photos", "scale=smoke", "stages=[views]", *where])
-        with pytest.raises(ValueError, match="objects/poses=colmap finds the cameras"):
-            context_of(given, tmp_path)
+    config = composed("objects=photos", "scale=smoke", "stages=[views]", *words, *where)
+    monkeypatch.setattr(Colmap, "find", lambda self, *more: Known().find(*more))
+    stage = context_of(config, tmp_path)[0].graph.views[0]
+    assert stage.refinement.rounds == 3 and stage.objects.source.poses == Colmap(features=900)
+    assert len(stage.objects.source.captures["can"].frames) == 11
+    given = composed("objects=photos", "scale=smoke", "stages=[views]", *where)
+    with pytest.raises(ValueError, match="objects/poses=colmap finds the cameras"):
+        context_of(given, tmp_path)

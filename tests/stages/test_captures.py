@@ -3,11 +3,11 @@
 import pytest
 import torch
 from captures import capture
+from composing import composed
 from documented_data import coco, meshes
-from hydra import compose, initialize_config_dir
 
 from neural_sim.field.scores import compare
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.objects.procedural import Procedural
 from neural_sim.synthesis.subjects import MeshSubject, PhotographedField
 from neural_sim.tasks.export import models_of
@@ -33,9 +33,8 @@ WIDE = ("camera.width=48", "camera.height=32")
 
 
 def started(root, folder, *overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        where = [f"objects.root={root}", f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"]
-        return context_of(compose("config", [*SMALL, *where, *overrides]), folder)
+    where = [f"objects.root={root}", f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"]
+    return context_of(composed(*SMALL, *where, *overrides), folder)
 
 
 def test_the_whole_way_with_a_target_rendered_from_fields(root, tmp_path):

@@ -7,11 +7,11 @@ from unittest.mock import Mock
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 from PIL import Image
 
 from neural_sim.baseline.label_shift.estimate import Estimate
-from neural_sim.main import build, conf_directory
+from neural_sim.main import build
 from neural_sim.outer.inner import RenderedPool
 from neural_sim.outer.records import Cost, LearnedPsi
 from neural_sim.stages import shown
@@ -21,10 +21,7 @@ from neural_sim.stages.store import Store
 
 
 def keys(tmp_path, *overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose(
-            "config", ["+experiment=pose_gap", "scale=smoke", *overrides, f"paths.store={tmp_path}"]
-        )
+    config = composed("+experiment=pose_gap", "scale=smoke", *overrides, f"paths.store={tmp_path}")
     graph = Graph(build(config))
     return graph.of_initial.key, graph.targets.key
 
@@ -52,10 +49,9 @@ def test_detectors_do_not_depend_on_the_target_but_its_images_do(tmp_path):
 def test_the_scored_detector_of_the_start_is_the_warm_start_where_images_and_epochs_are_equal(
     tmp_path, overrides
 ):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        common = ["+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}"]
-        graph = Graph(build(compose("config", common + overrides)))
-        other = Graph(build(compose("config", common)))
+    common = ["+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}"]
+    graph = Graph(build(composed(*(common + overrides))))
+    other = Graph(build(composed(*common)))
     assert graph.trained_on(graph.psi("initial"), "the start").key == graph.warm_start.key
     assert graph.trained_on(graph.psi("target"), "the target").key != graph.warm_start.key
     scored = other.trained_on(other.psi("initial"), "the start").key
@@ -64,21 +60,18 @@ def test_the_scored_detector_of_the_start_is_the_warm_start_where_images_and_epo
 
 
 def test_a_uniform_warm_start_is_trained_on_images_of_every_bin():
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        overrides = ["+experiment=pose_gap", "parameter=[pose,zoom]"]
-        graph = Graph(build(compose("config", overrides)))
+    overrides = ["+experiment=pose_gap", "parameter=[pose,zoom]"]
+    graph = Graph(build(composed(*overrides)))
     p = graph.experiment.imaging.distribution.probabilities(graph.warm_start.psi)
     assert all(torch.allclose(values, torch.full_like(values, 1 / values.shape[1])) for values in p.values())
     assert graph.warm_start.psi.shape == graph.psi("initial").shape
 
 
 def test_what_reads_psi_off_the_target_wants_no_warm_start_and_shares_the_renders_of_the_loop(tmp_path):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        common = ["+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}"]
-        loop, reading = (
-            Graph(build(compose("config", [*common, f"baseline={name}"])))
-            for name in ("neural_sim", "label_shift")
-        )
+    common = ["+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}"]
+    loop, reading = (
+        Graph(build(composed(*common, f"baseline={name}"))) for name in ("neural_sim", "label_shift")
+    )
     made = Results(Store(tmp_path)).missing([reading.learned])
     assert {stage.kind for stage in made if stage.phase == "psi"} == {"pool", "shown", "psi"}
     assert reading.read_warm_start == () and not any(stage.kind == "detector" for stage in made)
@@ -87,9 +80,8 @@ def test_what_reads_psi_off_the_target_wants_no_warm_start_and_shares_the_render
 
 
 def test_an_estimate_is_charged_for_the_renders_that_it_reads(tmp_path, monkeypatch):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = ["+experiment=pose_gap", "scale=smoke", "baseline=label_shift", f"paths.store={tmp_path}"]
-        stage = replace(Graph(build(compose("config", config))).shown, symmetries=())
+    config = ["+experiment=pose_gap", "scale=smoke", "baseline=label_shift", f"paths.store={tmp_path}"]
+    stage = replace(Graph(build(composed(*config))).shown, symmetries=())
     pool = RenderedPool(cast(Any, None), torch.Generator().get_state(), Cost(seconds=9.0, cpu_seconds=8.0))
     found = Estimate((), stage.psi, 5, 2.0, {"pool": 0.5, "images": 1.0})
     monkeypatch.setattr(shown, "estimate", lambda *arguments: found)
@@ -98,11 +90,10 @@ def test_an_estimate_is_charged_for_the_renders_that_it_reads(tmp_path, monkeypa
 
 
 def test_a_first_hypergradient_at_a_warm_start_of_other_images_is_refused():
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = ["+experiment=pose_gap", "baseline=auto_sim", "outer.train_first=false"]
-        build(compose("config", [*config, "training.warm_start=initial"]))
-        with pytest.raises(ValueError, match=r"training\.warm_start"):
-            build(compose("config", config))
+    config = ["+experiment=pose_gap", "baseline=auto_sim", "outer.train_first=false"]
+    build(composed(*config, "training.warm_start=initial"))
+    with pytest.raises(ValueError, match=r"training\.warm_start"):
+        build(composed(*config))
 
 
 def test_objects_that_no_source_has_are_refused(tmp_path):
@@ -130,9 +121,8 @@ def test_the_target_s_distribution_is_known_where_it_is_rendered_or_stated(
     entry = {"id": 1, "file_name": "a.png", "height": 8, "width": 8}
     labels.write_text(json.dumps({"images": [entry], "annotations": [], "categories": []}))
     photographs = ["target=coco", f"target.annotations={labels}"] if target == "coco" else []
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        words = ["scale=smoke", *photographs, *overrides, f"paths.store={tmp_path}"]
-        graph = Graph(build(compose("config", words)))
+    words = ["scale=smoke", *photographs, *overrides, f"paths.store={tmp_path}"]
+    graph = Graph(build(composed(*words)))
     assert (graph.target_psi is not None) == known
     psi = graph.psi("initial")
     assert ("matched" in graph.compared(LearnedPsi(psi[None], []))) == known
@@ -145,7 +135,6 @@ def test_the_target_s_distribution_is_known_where_it_is_rendered_or_stated(
 
 
 def test_stages_that_the_loop_cannot_train_are_refused_before_anything_is_made():
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        graph = Graph(build(compose("config", ["+experiment=pose_gap", "outer.loop_layers=4"])))
+    graph = Graph(build(composed("+experiment=pose_gap", "outer.loop_layers=4")))
     with pytest.raises(ValueError, match=r"outer\.loop_layers must be at least 0 and below 4, got 4"):
         _ = graph.learned

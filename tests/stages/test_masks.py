@@ -3,10 +3,10 @@
 import pytest
 import torch
 from captures import capture, on_a_table
-from hydra import compose, initialize_config_dir
+from composing import composed
 from scenes import Room
 
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.objects.procedural import Procedural
 from neural_sim.renderer.raycast import RaycastRenderer
 
@@ -26,10 +26,9 @@ def root(tmp_path_factory):
 
 
 def graph_of(root, folder, *overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        where = [f"objects.root={root}", f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"]
-        context, _ = context_of(compose("config", [*SMALL, *where, *overrides]), folder)
-        return context.graph, context.results
+    where = [f"objects.root={root}", f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"]
+    context, _ = context_of(composed(*SMALL, *where, *overrides), folder)
+    return context.graph, context.results
 
 
 def test_masks_are_stored_and_keyed_by_what_makes_them(root, tmp_path):

@@ -5,12 +5,12 @@ import shutil
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import train_detector
-from neural_sim.main import build, conf_directory, context_of
+from neural_sim.main import build, context_of
 from neural_sim.randomness import stream
 from neural_sim.stages.graph import Graph
 from neural_sim.target.rendered import RenderedTarget
@@ -25,13 +25,12 @@ SMALL = [
 ROWS = {"ns", "learned", "matched", "synthetic_only", "real_only", "views_only"}
 
 
-def composed(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return compose("config", [*SMALL, *overrides])
+def small(*overrides):
+    return composed(*SMALL, *overrides)
 
 
 def graph_of(*overrides):
-    return Graph(build(composed(*overrides)))
+    return Graph(build(small(*overrides)))
 
 
 def keys(*overrides):
@@ -107,7 +106,7 @@ def folder(tmp_path_factory, empty_store):
 
 def run(folder, *overrides):
     paths = [f"paths.store={folder / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}"]
-    context, others = context_of(composed(*overrides, *paths), folder / "run")
+    context, others = context_of(small(*overrides, *paths), folder / "run")
     walk(context, others)
     return context
 

@@ -6,9 +6,9 @@ import re
 import pytest
 import torch
 from captures import capture
-from hydra import compose, initialize_config_dir
+from composing import composed
 
-from neural_sim.main import conf_directory, context_of
+from neural_sim.main import context_of
 from neural_sim.stages.field import FittedField
 from neural_sim.tasks.walk import walk
 
@@ -26,9 +26,8 @@ def root(tmp_path_factory):
 
 
 def started(root, folder, *overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        where = [f"objects.root={root}", f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"]
-        return context_of(compose("config", [*SMALL, *where, *overrides]), folder)
+    where = [f"objects.root={root}", f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"]
+    return context_of(composed(*SMALL, *where, *overrides), folder)
 
 
 def test_the_page_shows_photographs_masks_renders_and_bins(root, tmp_path, caplog):
@@ -79,9 +78,8 @@ def test_nothing_trains_on_debris_unless_told(root, tmp_path, monkeypatch):
 def test_meshes_have_a_page_too(tmp_path, caplog):
     mesh = ("objects.names=[can,mug]", "views.count=6", "views.held_out=2", "views.backend=raycast")
     own = [each for each in SMALL if not each.startswith("objects")]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        where = [f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db"]
-        context, tasks = context_of(compose("config", [*own, *mesh, *where]), tmp_path)
+    where = [f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db"]
+    context, tasks = context_of(composed(*own, *mesh, *where), tmp_path)
     with caplog.at_level(logging.INFO):
         walk(context, tasks)
     page = (tmp_path / "objects.html").read_text()

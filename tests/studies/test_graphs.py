@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 from PIL import Image
 
-from neural_sim.main import UserError, _with, conf_directory, context_of
+from neural_sim.main import UserError, _with, context_of
 from neural_sim.stages.reconstruction import ReconstructionStage
 from neural_sim.stages.scene import LoadedImagesStage, MeshSubjectStage
 from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
@@ -20,11 +20,10 @@ from neural_sim.types import LabelledImages
 def command(*overrides):
     """Of a command, with its other methods."""
 
-    def composed(more=()):
-        with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-            return compose("config", _with(["scale=smoke", *overrides], more))
+    def again(more=()):
+        return composed(*_with(["scale=smoke", *overrides], more))
 
-    return context_of(composed(), Path("unused"), composed)
+    return context_of(again(), Path("unused"), again)
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,10 @@ import json
 
 import pytest
 from captures import capture
-from hydra import compose, initialize_config_dir
+from composing import composed
 
 from neural_sim.configuration import UserError
-from neural_sim.main import conf_directory, context_of
+from neural_sim.main import context_of
 from neural_sim.objects.photos import Photos
 from neural_sim.report import box_page
 from neural_sim.tasks import box as task
@@ -23,11 +23,8 @@ def root(tmp_path):
 
 
 def run(root, tmp_path, *overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose("config", [
-            "stages=[box]", "box.seconds=0", "scale=smoke", f"paths.store={tmp_path}/store",
-            *(("objects=photos", f"objects.root={root}") if root else ()), *overrides,
-        ])  # fmt: skip
+    config = composed("stages=[box]", "box.seconds=0", "scale=smoke", f"paths.store={tmp_path}/store",
+        *(("objects=photos", f"objects.root={root}") if root else ()), *overrides)  # fmt: skip
     context, tasks = context_of(config, tmp_path)
     list(tasks["box"].reads(context))
     tasks["box"].run(context)

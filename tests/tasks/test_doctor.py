@@ -5,9 +5,9 @@ import json
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 
-from neural_sim.main import conf_directory, context_of
+from neural_sim.main import context_of
 from neural_sim.stages.store import Store
 from neural_sim.tasks import doctor
 from neural_sim.tasks.context import TaskFailure
@@ -15,8 +15,7 @@ from neural_sim.tasks.context import TaskFailure
 
 def findings(tmp_path, *overrides):
     paths = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={tmp_path / 'mlflow.db'}"]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose("config", ["stages=[doctor]", *paths, *overrides])
+    config = composed("stages=[doctor]", *paths, *overrides)
     context, tasks = context_of(config, tmp_path)
     try:
         tasks["doctor"].run(context)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 from PIL import Image
 
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.stages.detail import finer_recipe, view_size_for
 from neural_sim.stages.store import locked
 from neural_sim.synthesis.export.images import ImageSource
@@ -34,14 +34,13 @@ def base(tmp_path_factory):
     return tmp_path_factory.mktemp("export")
 
 
-def composed(base, *overrides):
+def small(base, *overrides):
     paths = [f"paths.store={base / 'store'}", f"paths.mlflow={base / 'mlflow.db'}"]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return compose("config", [*SMALL, *paths, *overrides])
+    return composed(*SMALL, *paths, *overrides)
 
 
 def export(base, folder, *overrides):
-    context, others = context_of(composed(base, *overrides), folder)
+    context, others = context_of(small(base, *overrides), folder)
     walk(context, others)
     return folder / "dataset"
 
@@ -71,7 +70,7 @@ def test_a_data_set_needs_objects_and_a_psi_alone(made):
 def test_images_follow_the_psi_that_is_asked_for(base, made):
     """The dominant bin of the target is drawn most often, and the table says with which weight."""
     held = json.loads((made / "psi.json").read_text())
-    config = composed(base)
+    config = small(base)
     wanted = config.parameter.pose.biased.pitcher.target.dominant
     weights = held["psi"]["pitcher"]["pose"]
     assert int(np.argmax(weights)) == wanted - 1 and weights[wanted - 1] == pytest.approx(0.86)
@@ -209,14 +208,14 @@ def test_on_the_command_line_bad_settings_end_with_status_two(base, tmp_path):
 
 def test_views_for_larger_images_have_as_many_pixels_for_a_radius(base):
     """A square image of the views' field of view and nearest distance wants views of its own size."""
-    context, _ = context_of(composed(base, "unlearned.distance=[2.4,4.0]"), base / "unused")
+    context, _ = context_of(small(base, "unlearned.distance=[2.4,4.0]"), base / "unused")
     views, distribution = context.experiment.imaging.views, context.experiment.imaging.distribution
     assert view_size_for(views, views.camera(480), distribution, 1.0) in (480, 481)
     assert view_size_for(views, views.camera(480), distribution, 2.0) in (960, 961)
 
 
 def test_a_finer_recipe_has_more_steps_and_cells_and_may_be_fitted(base):
-    recipe = context_of(composed(base), base / "unused")[0].experiment.imaging.field
+    recipe = context_of(small(base), base / "unused")[0].experiment.imaging.field
     finer = finer_recipe(recipe, 3.0)
     assert isinstance(finer.fitting, functools.partial) and finer.steps == 60
     given = finer.fitting.keywords

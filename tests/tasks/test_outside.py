@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[2]
@@ -43,8 +43,7 @@ def plugin(tmp_path, monkeypatch):
 
 
 def context(folder, *overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose("config", ["+experiment=pose_gap", "scale=smoke", *overrides])
+    config = composed("+experiment=pose_gap", "scale=smoke", *overrides)
     return context_of(config, folder)
 
 

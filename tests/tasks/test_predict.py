@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 from colour_detector import ColourDetector
+from composing import composed
 from faster_coco_eval import COCO, COCOeval_faster
-from hydra import compose, initialize_config_dir
 from PIL import Image, ImageColor
 
 from neural_sim.detector.saved import SavedDetector
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.report.figures import CLASS_COLOURS
 from neural_sim.tasks.walk import walk
 
@@ -71,8 +71,7 @@ def annotated(folder, **changes):
 
 
 def predict(folder, *overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose("config", ["stages=[predict]", "progress=false", *overrides])
+    config = composed("stages=[predict]", "progress=false", *overrides)
     context, others = context_of(config, folder)
     walk(context, others)
     assert "experiment" not in vars(context) and "results" not in vars(context)  # nothing of a run was built

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from composing import composed
 from finished_runs import IMAGES, matches
-from hydra import compose, initialize_config_dir
 from scipy.stats import t as student
 
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.report.bootstrap import THRESHOLDS, Matches
 from neural_sim.report.page.verdict import Gain
 from neural_sim.report.score_table import ScoreTable
@@ -16,10 +16,7 @@ from neural_sim.tasks.repeat import APART, again, groups, sentence, table
 
 
 def context(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return context_of(
-            compose("config", ["+experiment=pose_gap", "scale=smoke", *overrides]), Path("unused")
-        )[0]
+    return context_of(composed("+experiment=pose_gap", "scale=smoke", *overrides), Path("unused"))[0]
 
 
 def test_the_first_training_is_the_runs_own_and_others_differ_in_their_seed_alone():

@@ -8,13 +8,13 @@ import signal
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composing import composed
 from mlflow import MlflowClient
 
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.training import train_detector
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.randomness import stream
 from neural_sim.report import tracking
 from neural_sim.report.run_tracking import LiveRun
@@ -33,8 +33,7 @@ SMALL = [
 
 def _context(folder, *overrides):
     paths = [f"paths.store={folder / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}"]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return context_of(compose("config", [*SMALL, *paths, *overrides]), folder / "run")
+    return context_of(composed(*SMALL, *paths, *overrides), folder / "run")
 
 
 def _targets(context) -> TargetSets:
@@ -155,8 +154,7 @@ def test_val_and_test_share_no_image(folder, returned):
     for seed in range(4):
         target = ["target=coco", f"target.annotations={path}", "target.val_fraction=0.5", f"seed={seed}"]
         small = [word for word in SMALL if not word.startswith("target.")]
-        with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-            config = compose("config", [*small, *target, f"paths.store={folder / 'store'}"])
+        config = composed(*small, *target, f"paths.store={folder / 'store'}")
         coco = _targets(context_of(config, folder)[0])
         assert len(coco.val) + len(coco.test) == len(twice)
         assert not _pixels(coco.val) & _pixels(coco.test)
@@ -169,8 +167,7 @@ def test_photographs_that_cannot_be_used_are_refused_before_fields_are_fitted(fo
     small = [word for word in SMALL if not word.startswith("target.")]
     target = ["target=coco", f"target.annotations={path}"]
     paths = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}"]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose("config", [*small, *target, *paths])
+    config = composed(*small, *target, *paths)
     with pytest.raises(UserError, match="not a readable image"):
         context_of(config, tmp_path)
     assert not (tmp_path / "store").exists()
@@ -222,8 +219,7 @@ def test_the_report_leaves_the_detector_that_was_scored_as_learned(
         f"predict.images={made}",
         f"predict.annotations={made / 'annotations.json'}",
     ]
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        walk(*context_of(compose("config", ["stages=[predict]", "progress=false", *words]), tmp_path))
+    walk(*context_of(composed("stages=[predict]", "progress=false", *words), tmp_path))
     assert (
         json.loads((tmp_path / "scores.json").read_text())["ap"] > 0.02
     )  # of the images that it was trained on

@@ -187,6 +187,6 @@ def _fit(module: DetectorModule, batches: Batches, device: torch.device) -> None
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="lightning")
-            trainer_on(device, module.how.epochs, progress=False).fit(module, batches)
+            trainer_on(device, module.how.epochs).fit(module, batches)
     finally:
         talker.setLevel(level)

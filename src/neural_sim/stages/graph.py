@@ -159,7 +159,7 @@ class Graph(Images):
         return PsiStage(
             self.warm_start, self.targets, self.pool, x.imaging.distribution, x.loop.method, parts, x.loop.outer,
             self.psi("initial"), x.run.seed, self.shown if isinstance(x.loop.method, LabelShift) else None,
-            self._symmetries if reads else (), x.run.progress, self.on_record,
+            self._symmetries if reads else (), self.on_record,
         )  # fmt: skip
 
     def synthetic(self, psi: Psi, called: str) -> DetectorStage:

@@ -84,7 +84,6 @@ class PsiStage(Stage[LearnedPsi]):
     seed: int
     shown: ShownStage | None = None
     symmetries: tuple[SymmetryStage, ...] = ()
-    progress: bool = field(default=False, metadata=UNKEYED)
     on_record: Callable[[IterationRecord], object] | None = field(default=None, metadata=UNKEYED)
 
     def __post_init__(self) -> None:
@@ -129,7 +128,7 @@ class PsiStage(Stage[LearnedPsi]):
             return LearnedPsi(torch.stack([self.initial, found.psi]), [], spent, found.factors)
         warm_start = results(self.warm_start)
         checkpoint = results.checkpoint(self, _STATE)
-        learned = learn_psi(self.loop(results), self.progress, self.on_record, checkpoint)
+        learned = learn_psi(self.loop(results), self.on_record, checkpoint)
         return replace(learned, before=warm_start.cost)
 
     def loop(self, results: Results) -> OuterLoop:

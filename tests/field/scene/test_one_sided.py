@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 from captures import on_a_table
-from hydra import compose, initialize_config_dir
+from composing import composed
 from PIL import Image
 
-from neural_sim.main import conf_directory, context_of
+from neural_sim.main import context_of
 from neural_sim.objects.procedural import Procedural
 from neural_sim.objects.ycb import YCB
 from neural_sim.renderer.raycast import RaycastRenderer
@@ -59,15 +59,12 @@ def run(root, folder):
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: said.append(record.getMessage())
     logging.getLogger("neural_sim").addHandler(handler)
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        context, tasks = context_of(
-            compose("config", [
-                "objects=photos", f"objects.root={root}", "objects.masks=scene", "objects.up=-y", "scale=quick",
-                "views.image_size=96", "stages=[views,field]", "progress=false",
-                f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db",
-            ]),
-            folder,
-        )  # fmt: skip
+    context, tasks = context_of(
+        composed("objects=photos", f"objects.root={root}", "objects.masks=scene", "objects.up=-y", "scale=quick",
+            "views.image_size=96", "stages=[views,field]", "progress=false",
+            f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"),
+        folder,
+    )  # fmt: skip
     walk(context, tasks)
     logging.getLogger("neural_sim").removeHandler(handler)
     return context, said

@@ -3,8 +3,8 @@
 import json
 
 import pytest
+from composing import composed
 from finished_runs import BUDGET, setting
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
@@ -210,8 +210,7 @@ def test_bad_settings_are_refused(arguments, message):
 
 def test_rows_name_the_runs_that_their_experiments_leave():
     """A study's runs are named by the experiments that it sweeps, others by their own."""
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        rows = compose("config", ["+experiment=experiments_table"]).experiments.rows
+    rows = composed("+experiment=experiments_table").experiments.rows
     for arguments in OmegaConf.to_container(rows).values():
         row = Row(**arguments)
         if not (row.exists and row.runs):

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composing import composed
 
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.studies.stress import linear, simplex
 from neural_sim.studies.stress.cases import CASES, Check, Scope
@@ -88,27 +88,21 @@ def test_bad_settings_name_their_key(tmp_path):
         ("stress.families=[]", "stress.families"),
         ("+stress.speed=1", "stress.speed"),
     ):
-        with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-            config = compose("config", ["+experiment=stress", override])
+        config = composed("+experiment=stress", override)
         with pytest.raises(UserError, match=message):
             context_of(config, tmp_path)
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        listed = compose("config", ["+experiment=stress"]).stress.families
+    listed = composed("+experiment=stress").stress.families
     assert tuple(listed) == FAMILIES
 
 
 def test_what_failed_is_counted_written_and_logged(context, monkeypatch):
     monkeypatch.setattr(simplex, "project_sum", lambda values: values)
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        config = compose(
-            "config",
-            [
-                "+experiment=stress",
-                "stress.families=[simplex]",
-                "progress=false",
-                f"paths.mlflow={context.config['paths']['mlflow']}",
-            ],
-        )
+    config = composed(
+        "+experiment=stress",
+        "stress.families=[simplex]",
+        "progress=false",
+        f"paths.mlflow={context.config['paths']['mlflow']}",
+    )
     with pytest.raises(TaskFailure) as caught:
         walk(*context_of(config, context.folder))
     held = json.loads((context.folder / "stress.json").read_text())

@@ -8,24 +8,23 @@ from pathlib import Path
 
 import pytest
 import torch
+from composing import composed
 from documented_checks import check_of
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.main import UserError, context_of
 from neural_sim.studies.work_precision.study import COMMAND, FAMILIES, WorkPrecision
 from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[3]
 
 
-def composed(*overrides):
-    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return compose("config", ["+experiment=work_precision", "progress=false", *overrides])
+def study(*overrides):
+    return composed("+experiment=work_precision", "progress=false", *overrides)
 
 
 def test_the_experiment_has_every_family_and_the_stages_that_they_need():
-    config = composed()
+    config = study()
     assert tuple(config.work_precision.families) == FAMILIES
     context, _ = context_of(config, Path("unused"))
     graph = context.graph
@@ -43,7 +42,7 @@ def test_the_experiment_has_every_family_and_the_stages_that_they_need():
 
 
 def test_the_parts_are_those_of_the_configuration(tmp_path):
-    step = context_of(composed("scale=smoke"), tmp_path)[1]["work_precision"]
+    step = context_of(study("scale=smoke"), tmp_path)[1]["work_precision"]
     assert set(step.solver.solvers) == {"cg", "minres", "identity"}
     detector = step.solver.detector(num_classes=2, image_size=32)
     trained = detector.split(detector.init(torch.Generator().manual_seed(0)))[1]
@@ -63,12 +62,12 @@ def test_the_parts_are_those_of_the_configuration(tmp_path):
 )
 def test_bad_settings_name_their_key(override, message, tmp_path):
     with pytest.raises(UserError, match=message):
-        context_of(composed(override), tmp_path)
+        context_of(study(override), tmp_path)
 
 
 def test_one_family_leaves_its_files_and_its_section_of_a_page(tmp_path, context):
     page = tmp_path / "page.md"
-    config = composed(
+    config = study(
         "scale=smoke", "work_precision.families=[quadrature]", f"work_precision.docs={page}",
         "work_precision.quadrature.samples=[8,16,32]", "work_precision.quadrature.rays=8",
         f"paths.mlflow={context.config['paths']['mlflow']}",

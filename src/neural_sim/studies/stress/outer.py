@@ -183,7 +183,7 @@ def loop(scope: Scope) -> Checks:
         (0.0, "shrink"), (math.nan, "keep"),
     )  # fmt: skip
     for value, choice in trials if scope.full else trials[:2]:
-        learned = learn_psi(_module(Constant(value), choice, iterations, scope), progress=False)
+        learned = learn_psi(_module(Constant(value), choice, iterations, scope))
         moved = float(learned.last.abs().max())
         certificate = learned.records[0].certificate
         status = certificate.actions["x"]["pose"] if certificate else ""
