@@ -79,6 +79,7 @@ GONE: dict[str, str] = {
 
 MOVED: dict[str, str] = {
     "baseline=neural_sim_paper_reinforce": "baseline=auto_sim_paper",
+    "baseline=neural_sim_label_shift": "baseline=neural_sim",
     "objects.poses=given": "objects/poses=given",
     "objects.poses=colmap": "objects/poses=colmap",
     **{

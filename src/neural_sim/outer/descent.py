@@ -43,7 +43,8 @@ class GradientLoop(OuterLoop, ABC):
 
     In a trust region, consecutive trainings use common random numbers. Each iteration begins with a training that
     accepts or rejects the last step, and the last iteration does nothing else. Before the first derivative, the loop
-    tries the psi that ``first`` proposes, if any. At the end every object goes back to the best psi that it has had.
+    tries the psi that ``first`` proposes, if any. The loop ends early where no object has a significant derivative left.
+    At the end every object goes back to the best psi that it has had.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class GradientLoop(OuterLoop, ABC):
         steps = self.settings.steps
         self._judges = isinstance(steps, TrustRegion)
         self._takes_back = isinstance(steps, TrustRegion) and steps.take_back
+        self._idle = 0
         self.numbers = replace(self.numbers, common=self._judges)
         start = self.psi[self._labels]
         self.steps: Steps = self.settings.steps.begin(self.objects, start, self.settings.iterations)
@@ -85,7 +87,8 @@ class GradientLoop(OuterLoop, ABC):
             derived = self._derive()
             trained, result = derived.trained, derived.result
             certificate = self._step(derived)
-            self._stopped = certificate.stopped
+            self._idle = self._idle + 1 if self._judges and not self.steps.pending else 0
+            self._stopped = certificate.stopped or self._idle == self.settings.patience
         best = self._way.best() if self._takes_back and (last or self._stopped) else {}
         scores = trained.scores if result is None else self._before
         outcome = Outcome(verdicts, {name: back for name, (_, back) in best.items()})
@@ -230,6 +233,7 @@ class GradientLoop(OuterLoop, ABC):
             "folds": len(self._folds),
             "before_folds": self._before_folds,
             "stopped": self._stopped,
+            "idle": self._idle,
         }
 
     @override
@@ -242,7 +246,7 @@ class GradientLoop(OuterLoop, ABC):
         super().restore(state)
         self.steps = replace(self.steps, **state["steps"])  # pyright: ignore[reportArgumentType]
         self._before, self._way = state["before"], Way(state["way"])
-        self._offered, self._stopped = state["offered"], state["stopped"]
+        self._offered, self._stopped, self._idle = state["offered"], state["stopped"], state["idle"]
 
     def _prepare(self) -> None:
         """Draw what the derivative needs in addition to the training images."""

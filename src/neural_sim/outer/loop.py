@@ -172,7 +172,8 @@ class OuterLoop(pl.LightningModule):
         self._cost, self._seconds, self._cpu = Cost(), {}, cpu
         now = perf_counter()
         self._durations.append(now - self._since)
-        self._since, left = now, fmean(self._durations) * (self.rounds - len(self.records))
+        self._since = now
+        left = None if self.ended else fmean(self._durations) * (self.rounds - len(self.records))
         logger.info(iteration_line(self.records, self.rounds, self._durations[-1], left))
         if certificate is not None:
             logger.debug(line(certificate, len(self.records), self.rounds, last.validation_loss))
@@ -221,7 +222,6 @@ class RewardLoop(OuterLoop):
 
 def learn_psi(
     module: OuterLoop,
-    progress: bool,
     on_record: Callable[[IterationRecord], object] | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> LearnedPsi:
@@ -229,7 +229,6 @@ def learn_psi(
 
     Args:
         module: the loop, not yet run.
-        progress: whether to show a progress bar.
         on_record: called with the record of each iteration when it ends.
         checkpoint: where to resume from, and what to write after each iteration.
     """
@@ -248,5 +247,5 @@ def learn_psi(
         warnings.filterwarnings("ignore", module="lightning")
         if not module.ended:
             # psi and its records are a few numbers: they stay on the CPU, wherever images and detector are.
-            trainer_on(torch.device("cpu"), progress=progress).fit(module)
+            trainer_on(torch.device("cpu")).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records, shown=module.shown)

@@ -10,14 +10,16 @@ from neural_sim.outer.records import IterationRecord
 _STEPS = ("kept", "shrunk")
 
 
-def iteration_line(records: Sequence[IterationRecord], iterations: int, seconds: float, left: float) -> str:
+def iteration_line(
+    records: Sequence[IterationRecord], iterations: int, seconds: float, left: float | None
+) -> str:
     """Describe the last iteration in one line: L_val, the verdict on the last steps, what moves next, and the time.
 
     Args:
         records: all records so far.
         iterations: number of iterations of the whole loop.
         seconds: duration of the iteration.
-        left: estimated seconds for the remaining iterations.
+        left: estimated seconds for the remaining iterations; None: the loop ends with this one.
     """
     last = records[-1]
     start = f" ({records[0].validation_loss:.3f} at the start)" if len(records) > 1 else ""
@@ -32,8 +34,10 @@ def iteration_line(records: Sequence[IterationRecord], iterations: int, seconds:
         for name, back in last.taken_back.items()
     )
     time = duration(seconds)
-    if len(records) < iterations:
+    if left is not None:
         time += f", about {duration(left)} left"
+    elif len(records) < iterations:
+        time += "; the loop ends here, for no step is left to try"
     return "; ".join([*parts, time])
 
 

@@ -28,7 +28,9 @@ class Outer:
     """The psi loop.
 
     Args:
-        iterations: number of outer iterations.
+        iterations: largest number of outer iterations.
+        patience: number of consecutive iterations without a step to try after which a trust region's loop ends; None:
+            all iterations are run.
         images_per_object: number of training images of each object in an iteration.
         epochs: epochs of an iteration's training.
         learning_rate: peak learning rate of that training.
@@ -65,6 +67,7 @@ class Outer:
     """
 
     iterations: PositiveInt = 10
+    patience: PositiveInt | None = None
     images_per_object: PositiveInt = 100
     epochs: NonNegativeInt = 6
     learning_rate: NonNegative = 3e-3
