@@ -10,6 +10,7 @@ from small_loop import CHECKED, small_loop
 from neural_sim.baseline.lts import LearningToSimulate
 from neural_sim.checkpoint import Checkpoint
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.outer.certificate import Trust
 from neural_sim.outer.first_step import FirstStep
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
@@ -81,6 +82,13 @@ LOOPS = {
     "first step": lambda scene: small_loop(
         scene, StratifiedEstimator(2), 3, pool_per_bin=2, first=Shifted(), **{**CHECKED, "steps": STEPS}
     ),
+    "idle": lambda scene: small_loop(
+        scene,
+        StratifiedEstimator(2),
+        4,
+        pool_per_bin=2,
+        **{**CHECKED, "steps": STEPS, "patience": 2, "trust": Trust(level=0.001)},
+    ),
     "paper": lambda scene: small_loop(scene, StratifiedEstimator(2), 3, start="previous"),
     "response": _response,
 }
@@ -91,7 +99,7 @@ def test_a_loop_that_was_killed_ends_at_the_same_bits(scene, interrupted, kind, 
     run, checkpoint = interrupted
     make, seen = lambda: LOOPS[kind](scene), []
     whole = _bits(learn_psi(make()))
-    run(make, {"response": 14, "paper": 1}.get(kind, 3))  # some iterations have ended
+    run(make, {"response": 14, "paper": 1, "idle": 1}.get(kind, 3))  # some iterations have ended
     done = len(checkpoint().read()["records"])
     assert 0 < done < len(whole[0]) - 1
     run(make, 0)  # and once more, in the middle of the next one

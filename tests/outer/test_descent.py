@@ -9,6 +9,7 @@ from small_loop import CHECKED, EVERY_STEP, small_loop
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import StratifiedEstimator
+from neural_sim.outer.certificate import Trust
 from neural_sim.outer.descent import learned_objects
 from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import learn_psi
@@ -258,6 +259,15 @@ def test_one_iteration_takes_the_first_step_alone(scene, monkeypatch):
 def test_a_first_step_wants_a_training_that_judges_it():
     with pytest.raises(ValueError, match="outer/first_step"):
         Outer(first_step=LabelShift(), steps=FreeSteps())
+
+
+def test_a_loop_ends_after_iterations_in_which_nothing_is_tried(scene):
+    """At so strict a level no derivative is significant."""
+    learned = learn_psi(checked_loop(scene, 6, patience=2, trust=Trust(level=0.001)))
+    assert len(learned.records) == 2 and not any(record.verdicts for record in learned.records)
+    assert torch.equal(learned.last, learned.trajectory[0])
+    tried = learn_psi(checked_loop(scene, 3, patience=1))
+    assert len(tried.records) == 3 and tried.records[1].verdicts
 
 
 def test_a_loop_returns_the_best_psi_on_the_way(scene, monkeypatch):
