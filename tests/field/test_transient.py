@@ -58,6 +58,7 @@ def with_occluders(views: PosedViews, share: float) -> PosedViews:
     return PosedViews(images, views.camera_to_world, views.camera, views.light_weights)
 
 
+@pytest.mark.slow
 def test_the_object_is_cleaner_with_transients_than_without(
     lit_ball: Callable[..., PosedViews], colour_error: Callable[[torch.Tensor, torch.Tensor], float]
 ) -> None:

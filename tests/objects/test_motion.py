@@ -228,6 +228,7 @@ def turntable(tmp_path_factory):
     return folder, poses.numpy(), np.stack(masks)
 
 
+@pytest.mark.slow
 def test_a_room_that_stands_still_is_told_from_an_object_that_turns(turntable, walk):
     folder, _, masks = turntable
     shots = read_album(folder, "mug").shots
@@ -240,6 +241,7 @@ def test_a_room_that_stands_still_is_told_from_an_object_that_turns(turntable, w
     assert standing_parts(read_album(walk[0], "table").shots[:7]) is None
 
 
+@pytest.mark.slow
 def test_cameras_of_a_turntable_are_those_about_the_object(turntable, caplog):
     folder, poses, masks = turntable
     for mask in (nothing, lambda shot: masks[int(shot.image.stem)]):

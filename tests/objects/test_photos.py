@@ -237,6 +237,7 @@ def test_a_box_bounds_centre_and_radius(tmp_path):
     assert abs(bottom[1] - expected) < 2.0 * cell
 
 
+@pytest.mark.slow
 def test_directions_are_those_of_the_views(tmp_path):
     """Without a mask, from where the cameras look: within a few degrees of the cameras of the placed views."""
     capture(tmp_path, count=12)

@@ -94,7 +94,10 @@ LOOPS = {
 }
 
 
-@pytest.mark.parametrize("kind", LOOPS)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(name, marks=pytest.mark.slow) if name in ("response", "paper") else name for name in LOOPS],
+)
 def test_a_loop_that_was_killed_ends_at_the_same_bits(scene, interrupted, kind, caplog):
     run, checkpoint = interrupted
     make, seen = lambda: LOOPS[kind](scene), []

@@ -59,7 +59,8 @@ def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
 
 
 ESTIMATORS = [
-    PathwiseEstimator(), PathwiseEstimator("reverse"), StratifiedEstimator(probes_per_bin=1), ReinforceEstimator()
+    PathwiseEstimator(), StratifiedEstimator(probes_per_bin=1), ReinforceEstimator(),
+    pytest.param(PathwiseEstimator("reverse"), marks=pytest.mark.slow),
 ]  # fmt: skip
 
 

@@ -143,6 +143,7 @@ def test_the_stratified_derivative_is_that_of_enumeration(several, counts):
 
 
 @pytest.mark.parametrize("counts", [(0, 3)])
+@pytest.mark.slow
 def test_the_score_functions_derivative_is_that_of_enumeration(several, counts):
     painted, generator = Painted(), torch.Generator().manual_seed(1)
     scene = painted.in_place_of_the_fields(several(counts))

@@ -72,6 +72,7 @@ def test_a_sweep_gets_the_ap_on_val_of_the_detector_trained_on_the_learned_distr
     assert returned == val and 0.0 < val < 1.0 and test != val
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_same_bit_for_bit(folder, returned, tmp_path, monkeypatch):
     shutil.copytree(folder / "store" / "views", tmp_path / "store" / "views")
     monkeypatch.setattr(

@@ -43,8 +43,8 @@ class GradientLoop(OuterLoop, ABC):
 
     In a trust region, consecutive trainings use common random numbers. Each iteration begins with a training that
     accepts or rejects the last step, and the last iteration does nothing else. Before the first derivative, the loop
-    tries the psi that ``first`` proposes, if any. The loop ends early where no object has a significant derivative left.
-    At the end every object goes back to the best psi that it has had.
+    tries the psi that ``first`` proposes, if any. The loop ends early once no object has a significant derivative. At
+    the end every object goes back to the best psi that it has had.
     """
 
     def __init__(

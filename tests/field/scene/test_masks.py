@@ -51,6 +51,7 @@ def masked(made):
     return photos, masks, logged
 
 
+@pytest.mark.slow
 def test_masks_are_those_of_the_object(made, masked):
     """An edge off by a pixel of these small photographs, in which the mug is 30 pixels wide, overlaps by 0.87."""
     _, masks, _ = masked
@@ -59,6 +60,7 @@ def test_masks_are_those_of_the_object(made, masked):
     assert np.median(overlaps(made, masks)) > 0.85
 
 
+@pytest.mark.slow
 def test_what_was_taken_is_logged(made, masked):
     """The plane in the log is the table, and the box holds the object's."""
     (line,) = (line for line in masked[2] if "stands on the plane" in line)
@@ -79,6 +81,7 @@ def test_what_was_taken_is_logged(made, masked):
     assert "covers" in line and "objects.box sets another box" in line
 
 
+@pytest.mark.slow
 def test_masks_place_and_crop_the_object(made, masked):
     photos, masks, _ = masked
     pictures = photos.pictures("mug", masks)
@@ -102,6 +105,7 @@ def test_pinholes_are_filled_and_other_holes_are_not():
     torch.testing.assert_close(without_pinholes(torch.zeros(4, 5)), torch.zeros(4, 5))
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_a_seed_gives_the_same_masks(made):
     few = SceneMasks(image_size=48, resolution=48, steps=40, batch_rays=1024)

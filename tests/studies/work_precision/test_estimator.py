@@ -42,6 +42,7 @@ def test_every_estimator_has_a_point_for_every_number_of_images(world):
     assert all(0.0 <= p.error <= 2.0 for p in cosines.points)
 
 
+@pytest.mark.slow
 def test_the_stratified_estimate_comes_near_the_reference_with_more_images(world):
     family = Estimators((8, 256), default=256, repeats=2, truth_per_bin=128, pathwise=())
     error = {p.setting: p.error for p in next(iter(family.measure(world, Timing(1), 0))).points}
