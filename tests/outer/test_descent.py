@@ -11,6 +11,7 @@ from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.outer.certificate import Trust
 from neural_sim.outer.descent import learned_objects
+from neural_sim.outer.first_step import read_objects
 from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
@@ -184,10 +185,11 @@ class Fake:
     psi: torch.Tensor
     p_values: tuple[float, ...] = (1e-3, 1e-3)
     given: list = field(default_factory=list)
+    shown: tuple[FactorEstimate, ...] = SHOWN
 
     def propose(self, scene, images, psi, generator):
         self.given.append((scene, images, psi))
-        return Proposal(self.psi, torch.tensor(self.p_values), images=7, shown=SHOWN)
+        return Proposal(self.psi, torch.tensor(self.p_values), images=7, shown=self.shown)
 
 
 THERE = torch.tensor([[3.0, 0.0, 0.0, 0.0], [0.0, 3.0, 0.0, 0.0]])
@@ -247,6 +249,37 @@ def test_a_first_step_that_finds_nothing_costs_no_training(scene):
     assert [r.detector_steps for r in one.records] == [r.detector_steps for r in other.records]
     assert other.records[0].verdicts == {} and other.shown == SHOWN
     assert torch.equal(one.last, other.last)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_an_object_that_was_read_takes_no_step_along_a_derivative_unless_a_training_rejects_it(
+    scene, monkeypatch, right
+):
+    psi = torch.stack([THERE[0], torch.zeros(4)])
+    module = checked_loop(scene, first=Fake(psi), refine="unread")
+    scored_by(monkeypatch, lambda psi: torch.stack([psi[0, 0] if right else -psi[0, 0], psi[1, 0] * 0.0]))
+    learned = learn_psi(module)
+    assert learned.records[0].verdicts["a"].accepted == right and len(learned.records) == 3
+    _, tried, *_ = learned.trajectory
+    assert torch.equal(tried[0], psi[0].double()) == right and bool(tried[1].any())
+
+
+@pytest.mark.parametrize("psi", [torch.zeros(2, 4), THERE], ids=["stay", "move"])
+def test_a_loop_whose_objects_were_all_read_ends_without_a_derivative(scene, monkeypatch, psi):
+    both = (*SHOWN, replace(SHOWN[0], name="b"))
+    module = checked_loop(scene, 4, first=Fake(psi, shown=both), refine="unread")
+    scored_by(monkeypatch, lambda psi: torch.stack([psi[0, 0], psi[1, 1]]))
+    learned = learn_psi(module)
+    (record,) = learned.records
+    assert torch.equal(learned.last, psi.double()) and record.certificate is None
+    # One training at the start, and one to judge what was proposed.
+    assert record.images == 7 + 12 * (2 if psi.any() else 1)
+
+
+def test_what_was_read_in_part_is_not_read():
+    zoom = replace(SHOWN[0], factor="zoom", finding="uncertain")
+    assert read_objects(SHOWN) == {"a"} and read_objects((*SHOWN, zoom)) == set()
+    assert read_objects((replace(SHOWN[0], finding="stays"),)) == {"a"}
 
 
 def test_one_iteration_takes_the_first_step_alone(scene, monkeypatch):

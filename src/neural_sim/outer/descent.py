@@ -16,7 +16,7 @@ from typing_extensions import override
 from neural_sim.detector.trajectory import Recording
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, certify
-from neural_sim.outer.first_step import FirstStep
+from neural_sim.outer.first_step import FirstStep, read_objects
 from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.objective import Objective
@@ -43,7 +43,8 @@ class GradientLoop(OuterLoop, ABC):
 
     In a trust region, consecutive trainings use common random numbers. Each iteration begins with a training that
     accepts or rejects the last step, and the last iteration does nothing else. Before the first derivative, the loop
-    tries the psi that ``first`` proposes, if any. The loop ends early once no object has a significant derivative. At
+    tries the psi that ``first`` proposes, if any; objects that it read stay there, unless the training rejected it
+    (``outer.refine``). The loop ends early once no object has a significant derivative. At
     the end every object goes back to the best psi that it has had.
     """
 
@@ -83,7 +84,11 @@ class GradientLoop(OuterLoop, ABC):
         if last or self.steps.pending:
             trained, verdicts = self._judge()
             self.psi.data[self._labels] = self.steps.reported
-        if trained is None or not last:
+        if not self.records and self.settings.refine == "unread":
+            self._settle(verdicts)
+        if self._stopped:
+            trained = trained or self._trained_once()
+        elif trained is None or not last:
             derived = self._derive()
             trained, result = derived.trained, derived.result
             certificate = self._step(derived)
@@ -117,6 +122,20 @@ class GradientLoop(OuterLoop, ABC):
             self._saw(self._before, self.objects.names)
             self.steps = tried
             self.psi.data[self._labels] = tried.reported
+
+    def _settle(self, verdicts: Mapping[str, Verdict]) -> None:
+        """Leave the objects that the first step read where they are; if it read all of them, the loop has ended."""
+        steps, rejected = self.steps, {name for name, verdict in verdicts.items() if not verdict.accepted}
+        settled = read_objects(self.shown) - rejected
+        if settled and isinstance(steps, TrustRegionSteps):
+            self._stopped = settled >= set(self.objects.names)
+            self.steps = steps.held(settled)
+
+    def _trained_once(self) -> Trained:
+        """Train at psi, to record what it is worth."""
+        trained = self.train_on(self.psi)
+        self._saw(trained.scores, self.objects.names)
+        return trained
 
     def _judge(self) -> tuple[Trained, dict[str, Verdict]]:
         """Train at psi, and accept or reject the step that led there."""

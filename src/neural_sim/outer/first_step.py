@@ -83,3 +83,9 @@ def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:
     """
     moving = [one.p_value for one in factors if one.name == name and one.finding == "moves"]
     return min(1.0, len(moving) * min(moving)) if moving else 1.0
+
+
+def read_objects(factors: Sequence[FactorEstimate]) -> set[str]:
+    """Return the names of the objects all of whose factors were read, whether psi moves to the estimate or stays."""
+    unread = {one.name for one in factors if one.finding not in ("moves", "stays")}
+    return {one.name for one in factors} - unread

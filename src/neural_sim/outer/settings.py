@@ -53,6 +53,8 @@ class Outer:
             get no probes and no second derivatives.
         certify_every: number of iterations between comparisons of the hypergradient with the finite-difference response
             of training at the same psi (``outer.response``, one training for each bin); 0: never.
+        refine: which objects take steps along derivatives after the first step: ``all``, or only those that it could
+            not read or whose reading a training rejected (``unread``).
         first_step: how the psi that is tried first is proposed: by the first derivative, or by what the target's boxes
             show.
         steps: how psi follows its derivative: freely, or in a trust region, under common random numbers, where the last
@@ -80,6 +82,7 @@ class Outer:
     quality: Quality | None = None
     learned: Annotated[Sequence[str], MinLen(1)] | None = None
     certify_every: NonNegativeInt = 0
+    refine: Literal["unread", "all"] = "all"
     first_step: Derivative | LabelShift = field(default_factory=Derivative)
     steps: TrustRegion | FreeSteps = field(default_factory=TrustRegion)
     adjoint: Unrolled | Implicit = field(default_factory=Unrolled)

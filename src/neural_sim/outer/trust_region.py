@@ -17,7 +17,7 @@ little about having none.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import Annotated
@@ -186,6 +186,12 @@ class TrustRegionSteps:
             expected=torch.zeros_like(self.expected),
             significance=_quantile(p_values.clamp(SMALLEST, 1.0 - SMALLEST)),
         )
+
+    def held(self, names: Collection[str]) -> TrustRegionSteps:
+        """Keep some objects where they are from now on."""
+        held = torch.tensor([name in names for name in self.objects.names])
+        radius = {factor: values.masked_fill(held, 0.0) for factor, values in self.radius.items()}
+        return replace(self, radius=radius)
 
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
