@@ -126,7 +126,11 @@ def test_weights_from_a_file_reach_the_features(tools, generator, tmp_path):
     torch.save([1, 2], tmp_path / "list.pth")
     (tmp_path / "text.pth").write_text("no weights")
     (tmp_path / "empty.pth").write_bytes(b"")
-    for name, wrong in (("list", "no state dictionary"), ("text", "no file of"), ("empty", "no file of")):
+    for name, wrong in (
+        ("list", "no state dictionary"),
+        ("text", "not a torch.save file"),
+        ("empty", "not a torch.save file"),
+    ):
         with pytest.raises(ValueError, match=wrong):
             tools.detector({"architecture": "resnet18", "weights": str(tmp_path / f"{name}.pth")})
 

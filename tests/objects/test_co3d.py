@@ -101,7 +101,7 @@ def test_the_sequence_is_the_best_or_the_longest_or_the_one_asked_for(tmp_path):
     assert best.digests() != Co3d(root, sequences={"mug": "long"}).digests()
     with pytest.raises(ValueError, match=r"mug has no sequence 'other', want one of long, short"):
         Co3d(root, sequences={"mug": "other"})
-    with pytest.raises(ValueError, match=r"objects\.sequences: \['can'\] are no objects"):
+    with pytest.raises(ValueError, match=r"objects\.sequences: \['can'\] are not objects"):
         Co3d(root, sequences={"can": "long"})
 
 

@@ -153,7 +153,7 @@ def test_checked_steps_want_trainings_that_can_be_compared(scene, bad):
 
 def test_objects_that_validation_does_not_show_keep_their_psi(scene, caplog):
     module = checked_loop(scene, shown=slice(3, 6))
-    assert "no validation image shows: a" in caplog.text
+    assert "so their psi stays as it is: a" in caplog.text
     learned = learn_psi(module)
     assert not learned.last[0].any() and set(learned.records[1].verdicts) == {"b"}
     assert all(set(record.certificate.actions) == {"b"} for record in learned.records[:2])

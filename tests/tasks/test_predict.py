@@ -227,4 +227,4 @@ def test_on_the_command_line_bad_input_ends_with_status_two(tmp_path):
         [sys.executable, "-m", "src.main", *words], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith("neural-sim: predict: predict.images: no picture")
+    assert done.stderr.splitlines()[-1].startswith("neural-sim: predict.images: no picture")

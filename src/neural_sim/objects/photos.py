@@ -91,13 +91,12 @@ class Photos:
         masks: source of the objects' masks, see ``Pictures``.
         up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; or a mapping
             by object name; null: the one in the capture's file, else the mean of the cameras' up vectors.
-        size: diameter of the object's bounding sphere in metres, or a mapping by object name; null: unknown, so
-            that distances are in object radii.
+        size: diameter of the bounding sphere in metres, or a mapping by object name; null: unknown (unit: radii).
         box: with ``masks="scene"``: two corners of a box around the object, along the axes of the capture's frame and
             in its unit, or a mapping by object name; null: the one in ``box.json`` in the capture's folder, else the
             object is searched where the cameras look.
         scene: computes masks if ``masks="scene"``.
-        refinement: corrects the cameras' poses; null: they are not changed.
+        refinement: corrects the cameras' poses, if given.
         poor: what happens if a field does not show its object: nothing trains on it (``refuse``), or it is used
             (``use``).
         poses: finds the cameras if there are only photographs; null: they are given, by ``transforms.json`` or a COLMAP
