@@ -9,7 +9,7 @@ from neural_sim.configuration import conf_directory
 yaml.SafeLoader = yaml.CSafeLoader  # with it a composition takes two thirds of the time
 
 
-def composed(*overrides: str, hydra: bool = False) -> DictConfig:
-    """Compose conf/config.yaml with overrides; ``hydra``: its own node, too."""
+def composed(*overrides: str, file: str = "config", hydra: bool = False) -> DictConfig:
+    """Compose a file of conf/ with overrides; ``hydra``: its own node, too."""
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return compose("config", list(overrides), return_hydra_config=hydra)
+        return compose(file, list(overrides), return_hydra_config=hydra)

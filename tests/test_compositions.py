@@ -7,6 +7,7 @@ import pytest
 from composing import composed
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.implicit import Implicit
 from neural_sim.gradient.pathwise import PathwiseEstimator
@@ -67,7 +68,7 @@ def test_the_papers_variant_takes_every_experiment(name):
 
 
 def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():
-    plain, auto_sim = experiment(), experiment("baseline=auto_sim")
+    plain, auto_sim = (experiment(f"baseline={name}") for name in ("neural_sim_derivative", "auto_sim"))
     assert isinstance(auto_sim.loop.method, HypergradientLoop)
     assert isinstance(plain.loop.gradient, StratifiedEstimator)
     assert isinstance(auto_sim.loop.gradient, ReinforceEstimator)
@@ -95,8 +96,8 @@ def _differences(one, other, where=""):
 
 
 PAIRS = [
-    ("neural_sim", "neural_sim_pathwise"),
-    ("neural_sim", "neural_sim_reinforce"),
+    ("neural_sim_derivative", "neural_sim_pathwise"),
+    ("neural_sim_derivative", "neural_sim_reinforce"),
     ("neural_sim_pathwise", "neural_sim_reinforce"),
     ("neural_sim_paper", "auto_sim_paper"),
 ]
@@ -112,10 +113,21 @@ def test_estimators_are_compared_in_one_loop(pair, scale):
     assert type(one.loop.gradient) is not type(other.loop.gradient)
     for made, name in ((one, pair[0]), (other, pair[1])):
         wanted = {
-            "neural_sim": StratifiedEstimator, "neural_sim_paper": PathwiseEstimator,
+            "neural_sim_derivative": StratifiedEstimator, "neural_sim_paper": PathwiseEstimator,
             "neural_sim_pathwise": PathwiseEstimator,
         }  # fmt: skip
         assert isinstance(made.loop.gradient, wanted.get(name, ReinforceEstimator))
+
+
+def test_neural_sim_reads_the_target_before_it_follows_derivatives():
+    plain, derivative = (experiment(f"baseline={name}") for name in ("neural_sim", "neural_sim_derivative"))
+    reads = {
+        "first_step": LabelShift(per_bin=48),
+        "refine": "unread",
+        "patience": 2,
+        "trust": Trust(level=0.01),
+    }
+    assert plain.loop.outer == dataclasses.replace(derivative.loop.outer, **reads)
 
 
 @pytest.mark.parametrize("scale", ["smoke", "quick", "paper"])

@@ -28,8 +28,7 @@ def test_untrusted_steps_are_skipped_stop_the_loop_are_shrunk_or_kept(scene, act
     learned = learn_psi(
         small_loop(
             scene, estimator, 2, detector=MICRO, adjoint=NOTHING_WILL_DO, trust=Trust(on_untrusted=action)
-        ),
-        False,
+        )
     )
     assert all(record.certificate.doubts == ["stationarity"] for record in learned.records)
     assert len(learned.records) == (1 if action == "stop" else 2)
