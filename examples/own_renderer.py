@@ -111,7 +111,7 @@ def main() -> None:
     )  # idle: the default derivative solves no system
     first = WhatTheTargetShows(reading)
     loop = SimulatorModule(inner, initial, StratifiedEstimator(probes_per_bin=16), solver, generator, first)
-    learned = learn_psi(loop, progress=False)
+    learned = learn_psi(loop)
 
     wanted = distribution.probabilities(target)["pose"]
     for when, psi in (("before", initial), ("after", learned.last)):

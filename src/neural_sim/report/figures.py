@@ -327,8 +327,9 @@ def write_figures(
     made: dict[str, Figure] = {}
     if before_and_after is not None and results.ap:
         made["strip"] = strip_figure(results, test, *before_and_after)
-    for factor in next(iter(bins.values()), {}) if bins else ():
-        made[f"bins_{factor}"] = bins_figure(results, bins, factor)
+    if bins:
+        for factor in next(iter(bins.values())):
+            made[f"bins_{factor}"] = bins_figure(results, bins, factor)
     names = list(results.names)
     for factor in results.factors if results.moved else ():
         title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"

@@ -48,7 +48,8 @@ def _number(job: Path) -> int:
 
 def _overrides(job: Path) -> dict[str, str]:
     words: Sequence[str] = yaml.safe_load((job / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
-    return dict(word.lstrip("+").partition("=")[::2] for word in words)
+    parts = (word.lstrip("+").partition("=") for word in words)
+    return {key: value for key, _, value in parts}
 
 
 def _scores(results: Mapping[str, Any] | None) -> list[str]:

@@ -93,5 +93,5 @@ def _labelled(root: Path, record: Record, names: Sequence[str]) -> Picture:
         for loop in outlines(mask_of(item["mask_visible"])):
             pen.polygon((scale * loop).flatten().tolist(), outline="white")
         pen.rectangle((x, y, x + width, y + height), outline=colour, width=2)
-    said = ", ".join(names[item["label"]] for item in shown) or "no object"
+    said = ", ".join([names[int(item["label"])] for item in shown]) or "no object"
     return Picture(jpeg(image), f"{record['number']}: {said}")
