@@ -66,6 +66,13 @@ def test_what_the_target_shows_is_in_the_results_the_summary_and_the_history(res
     assert held["shown"][0]["low"] == [0.7, 0.0, 0.0, 0.0] and held["shown"][0]["finding"] == "moves"
     assert "your target shows the a from pose bin 1 (0.70 to 0.90)" in read.summary()
     assert [history[0] for history in read.learned[0].history] == [0.25, 0.85]
+    # A loop that ended after its first step: its one record is of the training there.
+    record = {
+        **results.records[0],
+        "probabilities": {"pose": results.probabilities["learned"]["pose"].tolist()},
+    }
+    stepped = dataclasses.replace(read, records=[record])
+    assert [history[0] for history in stepped.learned[0].history] == [0.25, 0.85]
     assert read.moved and not dataclasses.replace(read, shown=()).moved
 
 

@@ -127,7 +127,9 @@ class RunResults:
                 groups = self.symmetric_bins.get(name, {}).get(factor) or bins
                 listed = {which: values.tolist() for which, values in p.items()}
                 steps = [record["probabilities"][factor][label] for record in self.records]
-                history = [*(steps or [listed["initial"]] * bool(self.shown)), listed["learned"]]
+                # The first record may already be that of a first step.
+                before = [listed["initial"], *steps[1:]] if self.moved else []
+                history = [*before, listed["learned"]]
                 found.append(Learned(name, factor, groups, listed, history, _distances(p, groups)))
         return tuple(found)
 
