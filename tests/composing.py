@@ -4,7 +4,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from neural_sim.configuration import conf_directory
+from neural_sim.main import conf_directory  # which also registers the resolvers of conf/
 
 yaml.SafeLoader = yaml.CSafeLoader  # with it a composition takes two thirds of the time
 
