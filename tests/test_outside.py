@@ -111,7 +111,8 @@ def test_a_target_is_parted_letterboxed_and_keyed_like_all_others(tmp_path):
 def test_they_run_together(adjoint, tmp_path):
     config = outside(
         *MINE.values(), "objects.names=[can,mug]", "stages=[views,field,target_sets,warm_start,psi,evaluate]",
-        f"outer/adjoint={adjoint}", "outer/steps=free", "outer.trust.on_untrusted=keep", "progress=false",
+        f"outer/adjoint={adjoint}", "baseline=neural_sim_derivative", "outer/steps=free",
+        "outer.trust.on_untrusted=keep", "progress=false",
         f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db",
     )  # fmt: skip
     context, others = context_of(config, tmp_path)

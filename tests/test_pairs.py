@@ -75,6 +75,10 @@ REFUSED = {
         lambda a, b: a == "outer.start=previous" and (b in REWARDED or b == "outer/steps=trust_region"),
         "compares trainings",
     ),
+    "not judged": (
+        lambda a, b: a == "baseline=neural_sim" and b == "outer/steps=free",
+        "outer/first_step: a training accepts or rejects",
+    ),
     "untrained": (
         lambda a, b: "train_first=false" in a and b in ("outer/steps=trust_region", "outer/adjoint=unrolled"),
         "train_first=true",
@@ -160,11 +164,15 @@ def configuration(room, row):
 
 
 EXAMPLES = [
+    ("not judged", ["baseline=neural_sim", "outer/steps=free"]),
     ("lights", ["parameter=[illumination]", "renderer=nerf"]),
     ("codes", ["renderer=nerf_w", "field=mlp"]),
     ("going on", ["baseline=lts_by_object", "outer.start=previous"]),
     ("going on", ["outer/steps=trust_region", "outer.start=previous"]),
-    ("untrained", ["outer/adjoint=unrolled", "outer.train_first=false", "outer/steps=free"]),
+    (
+        "untrained",
+        ["outer/adjoint=unrolled", "outer.train_first=false", "outer/steps=free outer/first_step=derivative"],
+    ),
     ("dense", ["baseline=auto_sim", "solver=exact", "detector=tiny"]),
     ("no camera", ["camera=from_target", "target=rendered"]),
 ]

@@ -69,7 +69,6 @@ class Outer:
     """
 
     iterations: PositiveInt = 10
-    patience: PositiveInt | None = None
     images_per_object: PositiveInt = 100
     epochs: NonNegativeInt = 6
     learning_rate: NonNegative = 3e-3
@@ -82,6 +81,7 @@ class Outer:
     quality: Quality | None = None
     learned: Annotated[Sequence[str], MinLen(1)] | None = None
     certify_every: NonNegativeInt = 0
+    patience: PositiveInt | None = None
     refine: Literal["unread", "all"] = "all"
     first_step: Derivative | LabelShift = field(default_factory=Derivative)
     steps: TrustRegion | FreeSteps = field(default_factory=TrustRegion)
