@@ -58,7 +58,7 @@ def measured(
     with tempfile.TemporaryDirectory() as folder:
         writer = ImageWriter(source, Path(folder), image_format, 1000 if bop else None, 0.01)
         first = max(workers, 1)
-        made = each(writer, list(range(count + first)), workers)
+        made = each(writer, list(range(count + first)), workers, Path(folder))
         for _ in range(first):
             next(made)
         begun, used = time.perf_counter(), time.process_time()

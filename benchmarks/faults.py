@@ -1,8 +1,8 @@
 """Kill a run at random moments, damage its files, count what is lost: `python benchmarks/faults.py --out faults.json`.
 
 One small run, from objects to a report and a data set, is the reference. Then the same command is killed and started
-again, in chains on one store, until it ends; every chain must leave the reference's results, bit for bit. At last bits
-of the store's files are flipped and files cut off, and none may be used.
+again, in chains on one store, until it ends; every chain must leave the reference's results, bit for bit. Bits of the
+store's files are flipped and files cut off, and none may be used. At last several of the command are begun at one time.
 """
 
 from __future__ import annotations
@@ -281,12 +281,34 @@ def _flipped(content: bytes, random: Random) -> bytes:
     return content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :]
 
 
+def together(work: Path, bits: Mapping[str, str], count: int) -> dict[str, Any]:
+    """Begin the command several times at one time, on one store and one database."""
+    place = Place(work / "together")
+    place.root.mkdir()
+    shutil.copy(work / "empty.db", place.root / "mlflow.db")
+    begun = time.monotonic()
+    processes = [place.start() for _ in range(count)]
+    for process in processes:
+        process.join()
+    seconds = time.monotonic() - begun
+    runs = [Place(place.root, number) for number in range(1, count + 1)]
+    different = {key for run in runs for key, bit in {**bits, **run.bits()}.items() if bits.get(key) != bit}
+    lost = {key for run in runs for key in bits.keys() - run.bits().keys()}
+    return {
+        "count": count, "failed": sum(process.exitcode != 0 for process in processes),
+        "different": sorted(different | lost), "seconds": round(seconds, 1),
+        "waits": sum(run.log.count("store: waiting") for run in runs),
+        "left_running": _running(place.root / "mlflow.db"),
+    }  # fmt: skip
+
+
 def main() -> None:
     """Run all, and write the document."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50, help="by SIGKILL")
     parser.add_argument("--terms", type=int, default=20, help="by SIGTERM")
     parser.add_argument("--damages", type=int, default=1000, help="of files")
+    parser.add_argument("--together", type=int, default=8, help="runs at one time")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="a JSON file")
     given, random = parser.parse_args(), Random(0)
@@ -319,6 +341,7 @@ def main() -> None:
             document[name] = {"count": count, **vars(ends)}
         logging.getLogger("neural_sim.stages.store").setLevel(logging.ERROR)
         document["damages"] = damages(place, checkpoint, given.damages, random)
+        document["together"] = together(work, reference, given.together)
     print(json.dumps(document, indent=1))
     if given.out is not None:
         write_json(given.out, document)

@@ -1,6 +1,7 @@
 """Small shared scenes, and where the real data lies."""
 
 import os
+import sys
 from pathlib import Path
 
 import jaxtyping
@@ -61,3 +62,26 @@ def wrong_shapes():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="session")
+def ray_cluster():
+    """Three machines of one core each, all of them processes of this one, which ``workers=ray`` connects to."""
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    machine = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))  # of the machines
+        try:
+            cluster = Cluster(initialize_head=True, head_node_args=machine)
+        except Exception as error:  # that class itself, after a time that no setting changes
+            if "timed out during startup" not in str(error):
+                raise
+            pytest.skip(f"this machine is too busy to begin a cluster: {error}")
+        for _ in range(2):
+            cluster.add_node(**machine)
+        patched.setenv("RAY_ADDRESS", cluster.address)
+        yield cluster
+        ray.shutdown()
+        cluster.shutdown()

@@ -17,7 +17,7 @@ from neural_sim.stages.stage import UNKEYED, Stage
 
 @dataclass(frozen=True)
 class Number(Stage[dict]):
-    """A value plus those of its inputs, with the process that made it and when."""
+    """A value plus those of its inputs, with the process that made it and when; ``begun`` gets a line at once."""
 
     phase: ClassVar[str] = "numbers"
     kind: ClassVar[str] = "number"
@@ -25,6 +25,7 @@ class Number(Stage[dict]):
     value: int
     of: tuple[Stage, ...] = ()
     seconds: float = field(default=0.0, metadata=UNKEYED)
+    begun: Path | None = field(default=None, metadata=UNKEYED)
     hook: Callable | None = field(default=None, metadata=UNKEYED)
 
     @property
@@ -33,6 +34,9 @@ class Number(Stage[dict]):
 
     def make(self, results):
         begun = time.time()
+        if self.begun is not None:
+            with self.begun.open("a") as stream:
+                stream.write(f"{self.value} {os.getpid()}\n")
         total = self.value + sum(results(stage)["total"] for stage in self.of)
         logging.getLogger(__name__).warning("made %d with %d threads", self.value, torch.get_num_threads())
         if self.value < 0:

@@ -9,7 +9,11 @@ import pytest
 from neural_sim import extras
 
 ROOT = Path(__file__).parents[1]
-DISTRIBUTIONS = {"skimage": "scikit-image"}
+DISTRIBUTIONS = {
+    "skimage": "scikit-image",
+    "hydra_plugins.hydra_joblib_launcher": "hydra-joblib-launcher",
+    "hydra_plugins.hydra_submitit_launcher": "hydra-submitit-launcher",
+}
 
 
 @pytest.mark.parametrize("extra", extras.PACKAGES)

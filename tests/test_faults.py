@@ -21,6 +21,8 @@ def test_kills_lose_nothing_and_damage_is_not_used(tmp_path):
         "1",
         "--damages",
         "60",
+        "--together",
+        "2",
     ]
     done = subprocess.run(
         [*command, "--out", tmp_path / "faults.json"],
@@ -36,3 +38,5 @@ def test_kills_lose_nothing_and_damage_is_not_used(tmp_path):
         assert ends["statuses"] == {status: count} and ends["same"] == ends["chains"] > 0
         assert not ends["different"] and ends["iterations_lost"] <= 1 and not ends["left_running"]
     assert found["damages"]["count"] == 60 and found["damages"]["used"] == 0
+    together = found["together"]
+    assert not together["failed"] and not together["different"] and not together["left_running"]

@@ -7,10 +7,10 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = (
-    "types", "alpha", "checkpoint", "digests", "documents", "extras", "interruption", "processes", "randomness",
-    "configuration", "commandline", "guide", "ranges", "cameras", "devices", "pictures", "masks", "objects", "field",
-    "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "report",
-    "stages", "tasks", "studies", "main",
+    "types", "alpha", "checkpoint", "digests", "documents", "interruption", "processes", "randomness", "configuration",
+    "extras", "workers", "commandline", "guide", "ranges", "cameras", "devices", "pictures", "masks", "objects",
+    "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer",
+    "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
@@ -57,6 +57,7 @@ def test_heavy_libraries_stay_in_their_rooms():
         "h5py": {"target/ycb_video.py"},
         "skimage": {"field/reconstruction.py"},
         "hydra": {"main.py"},
+        "ray": {"workers.py"},
         "omegaconf": {"main.py"},
     }
     for path, package, module in _imports():

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from neural_sim.configuration import UserError, first_line
+from neural_sim.extras import require
 
 OWN_WORDS = ("--config-name", "-cn", "--config-path", "-cp", "--shell-completion", "-sc", "--hydra-help")
 """Flags with which the configuration is another, or the words are no settings: nothing is checked here."""
@@ -66,6 +67,11 @@ class Layout:
                 if group not in (".", "paper") and not group.startswith("hydra"):
                     found.setdefault(group, set()).add(path.stem)
         return {group: tuple(sorted(found[group])) for group in sorted(found)}
+
+    @property
+    def launchers(self) -> set[str]:
+        """The ways to run a sweep's jobs that are no part of Hydra itself."""
+        return {path.stem for path in (self.folders[0] / "hydra" / "launcher").glob("*.yaml")}
 
     @cached_property
     def defaults(self) -> dict[str, Key]:
@@ -139,6 +145,8 @@ def checked(words: Sequence[str], layout: Layout, commands: Iterable[str] = ()) 
         key, equals, value = name.partition("=")
         if not equals and not word.startswith("~"):
             raise UserError(_no_setting(word, layout, commands))
+        if key == "hydra/launcher" and value in layout.launchers:
+            require("sweeps", word)
         if key.startswith("hydra") or "@" in key:
             continue
         if key == "stages":

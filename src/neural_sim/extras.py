@@ -1,8 +1,11 @@
-"""Packages that only some inputs and outputs need: the extras of pyproject.toml."""
+"""Packages that only some inputs, outputs and ways to run need: the extras of pyproject.toml."""
 
 from __future__ import annotations
 
 import importlib.util
+from contextlib import suppress
+
+from neural_sim.configuration import UserError
 
 PACKAGES = {
     "photos": ("pycolmap", "skimage"),
@@ -10,6 +13,8 @@ PACKAGES = {
     "onnx": ("onnx", "onnxscript", "onnxruntime"),
     "viewer": ("viser",),
     "video": ("av",),
+    "ray": ("ray",),
+    "sweeps": ("hydra_plugins.hydra_joblib_launcher", "hydra_plugins.hydra_submitit_launcher"),
 }
 """The modules that each extra installs."""
 
@@ -22,8 +27,18 @@ def require(extra: str, what: str) -> None:
         what: what needs them, with which the message begins: a configuration key or a file.
 
     Raises:
-        ValueError: for packages that are missing, with the command that installs them.
+        UserError: for packages that are missing, with the command that installs them.
     """
-    missing = [name for name in PACKAGES[extra] if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ValueError(f"{what}: {', '.join(missing)} not installed; pip install 'neural-sim[{extra}]'")
+    if missing := missing_of(extra):
+        raise UserError(f"{what}: {', '.join(missing)} not installed; pip install 'neural-sim[{extra}]'")
+
+
+def missing_of(extra: str) -> list[str]:
+    """Return the modules of an extra that are not installed."""
+    return [name for name in PACKAGES[extra] if not _installed(name)]
+
+
+def _installed(name: str) -> bool:
+    with suppress(ModuleNotFoundError):  # of the package that it is in
+        return importlib.util.find_spec(name) is not None
+    return False

@@ -69,7 +69,8 @@ _TOP = {
     "score_at": list[PositiveFraction],
     "progress": bool,
     "resume": bool,
-    "workers": PositiveInt,
+    "workers": PositiveInt | Literal["ray"],
+    "worker_gpus": PositiveFraction,
     "trainer": TypedDict("Trainer", {"accelerator": Literal["cpu", "gpu"]}),
 }
 
@@ -99,6 +100,7 @@ def _build(plain: dict[str, Any]) -> Experiment:
         progress=plain["progress"],
         resume=plain["resume"],
         workers=plain["workers"],
+        worker_gpus=plain["worker_gpus"],
         score_at=tuple(plain["score_at"]),
         task=plain["task"],
     )

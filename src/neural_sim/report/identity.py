@@ -17,7 +17,7 @@ SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "det
 METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint")
 """Keys of ``parameter.*`` and ``synthesis`` that say how a method draws, steps and differentiates; the rest says where
 it starts and what it aims at."""
-RUN_KEYS = ("seed", "score_at", "stages", "progress", "resume", "workers", "paths", "trainer")
+RUN_KEYS = ("seed", "score_at", "stages", "progress", "resume", "workers", "worker_gpus", "paths", "trainer")
 """Keys by which runs of the same settings may differ."""
 SHOWN = 3
 """Differences that are named; the rest is counted."""

@@ -14,6 +14,7 @@ from neural_sim.configuration import UserError
 from neural_sim.detector.protocol import Detector, Score, score_of
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.detector.training import Training
+from neural_sim.extras import require
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.objects.mesh import MeshSource
@@ -30,6 +31,7 @@ from neural_sim.stages.psi import Method
 from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.base import Target
 from neural_sim.types import PinholeCamera
+from neural_sim.workers import Workers
 
 SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
 """What a task's detectors are scored by."""
@@ -42,10 +44,12 @@ class Run:
     """What a run is called and where it works.
 
     ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of ``SCORES``; with ``resume``
-    unfinished work of killed runs is taken up. ``workers`` processes make independent results side by side.
+    unfinished work of killed runs is taken up. ``workers`` make independent results side by side; on a cluster each
+    takes ``worker_gpus`` of a GPU.
 
     Raises:
         UserError: several processes on a GPU.
+        ValueError: a cluster without Ray.
     """
 
     name: str
@@ -55,15 +59,24 @@ class Run:
     accelerator: str = "cpu"
     progress: bool = False
     resume: bool = True
-    workers: int = 1
+    workers: Workers = 1
+    worker_gpus: float = 0.25
     score_at: tuple[float, ...] = ()
     task: str = "detection"
 
     def __post_init__(self) -> None:
-        if self.workers > 1 and self.accelerator != "cpu":
+        if self.workers == "ray":
+            require("ray", "workers=ray")
+        elif self.workers > 1 and self.accelerator != "cpu":
             raise UserError(
-                f"workers: want 1 with trainer=gpu, which all processes would share, got {self.workers}"
+                "workers: want 1 or ray with trainer=gpu, which all processes would share, got "
+                f"{self.workers}"
             )
+
+    @property
+    def gpus(self) -> float:
+        """Part of a GPU that a result takes on a cluster."""
+        return 0.0 if self.accelerator == "cpu" else self.worker_gpus
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Stages that need nothing of each other, made side by side by processes that share the store."""
+"""Stages that need nothing of each other, made side by side by workers that share the store."""
 
 from __future__ import annotations
 
@@ -7,34 +7,35 @@ import pickle
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from neural_sim.processes import processes
+from neural_sim.processes import Work, WorkersLost
 from neural_sim.stages.stage import Results, Stage
 from neural_sim.stages.store import Store
+from neural_sim.workers import Workers, workers
 
 _log = logging.getLogger(__name__)
 
 
-def make_together(results: Results, stages: Iterable[Stage[Any]], workers: int) -> None:
+def make_together(results: Results, stages: Iterable[Stage[Any]], by: Workers, gpus: float = 0.0) -> None:
     """Make what the store lacks of some stages and of what they need, each as soon as its own inputs are there.
 
-    Results are those of one process bit for bit: every process computes with as many threads as this one. Nothing is
+    Results are those of one process bit for bit: every worker computes with as many threads as this one. Nothing is
     made where no two of the stages could be made at one time.
 
     Args:
         results: whose store gets the results.
         stages: what is wanted.
-        workers: number of processes.
+        by: number of processes, or a cluster.
+        gpus: part of a GPU that a stage takes on a cluster.
 
     Raises:
-        ValueError: as making the stages one after another.
+        ValueError: as making the stages one after another, and for a cluster that cannot be used.
     """
-    if workers < 2:
+    if by == 1:
         return
     missing = {stage.entry: stage for stage in results.missing(stages) if stage.stored}
     waiting = {name: set(_needed(stage, missing)) for name, stage in missing.items() if _can_be_sent(stage)}
@@ -43,25 +44,25 @@ def make_together(results: Results, stages: Iterable[Stage[Any]], workers: int) 
         waiting = {name: needed for name, needed in waiting.items() if name not in kept}
     if _most_at_once(waiting) < 2:
         return
-    make = _Make(results.store.root, results.resume)
-    _log.info("%d results, made by up to %d processes", len(waiting), workers)
+    root = results.store.root.resolve()
+    work = Work(_Make(root, results.resume), root, torch.get_num_threads(), gpus)
+    who = "the machines of a Ray cluster" if by == "ray" else f"up to {by} processes"
+    _log.info("%d results, made by %s", len(waiting), who)
     try:
-        with processes(min(workers, len(waiting)), make, torch.get_num_threads()) as (pool, run):
+        with workers(by, len(waiting), work) as submit:
             running: dict[Future[None], str] = {}
             while waiting or running:
                 for name in [name for name, needed in waiting.items() if not needed]:
                     del waiting[name]
-                    running[pool.submit(run, missing[name])] = name
+                    running[submit(missing[name])] = name
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     future.result()
                     made = running.pop(future)
                     results.seen(made)
                     for needed in waiting.values():
                         needed.discard(made)
-    except BrokenProcessPool:
-        _log.warning(
-            "a process was ended from outside, perhaps for want of memory: the rest is made one by one"
-        )
+    except WorkersLost as lost:
+        _log.warning("%s: the rest is made one by one", lost)
 
 
 class _Make:

@@ -120,11 +120,11 @@ class Context:
             self.live.iteration(dataclasses.asdict(record))
 
     def together(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
-        """Make what the store lacks of these stages side by side, by as many processes as the run has."""
-        wanted = list(stages)
+        """Make what the store lacks of these stages side by side, by the workers that the run has."""
+        wanted, run = list(stages), self.experiment.run
         if wanted:
             with self.account.charged(wanted[0].phase):
-                make_together(self.results, wanted, self.experiment.run.workers)
+                make_together(self.results, wanted, run.workers, run.gpus)
         return wanted
 
     def shown(self, items: Iterable[T], name: str) -> Iterable[T]:

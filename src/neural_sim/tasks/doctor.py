@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import shutil
@@ -20,7 +19,7 @@ import neural_sim
 from neural_sim.configuration import first_line
 from neural_sim.devices import device_of
 from neural_sim.documents import markdown_table, write_json
-from neural_sim.extras import PACKAGES
+from neural_sim.extras import PACKAGES, missing_of
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.renderer.views import opengl_platform
 from neural_sim.report.provenance import gpu
@@ -163,8 +162,8 @@ def packages() -> Iterator[Finding]:
             "bad", "pyrender", "pyrender itself is installed over scikit-robot-pyrender, whose files it overwrites",
             "pip uninstall pyrender scikit-robot-pyrender; pip install scikit-robot-pyrender",
         )  # fmt: skip
-    for extra, modules in PACKAGES.items():
-        missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    for extra in PACKAGES:
+        missing = missing_of(extra)
         if missing:
             command = f"pip install 'neural-sim[{extra}]' if you need it"
             yield Finding("note", f"extra {extra}", f"{', '.join(missing)} not installed", command)

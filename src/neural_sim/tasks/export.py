@@ -37,6 +37,7 @@ from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
 from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.tasks.context import Context, Task
+from neural_sim.workers import Workers
 
 _log = logging.getLogger(__name__)
 
@@ -65,7 +66,8 @@ class ExportTask(Task):
             run's.
         largest_views: largest side, in pixels, of the views of ``detail=auto``.
         scene_size: images of a scene of BOP.
-        workers: processes; 0: this one alone; null: one for each core, this one alone with a GPU.
+        workers: processes; 0: this one alone; null: those of the run where that is a cluster, else one for each core,
+            this one alone with a GPU.
 
     Raises:
         ValueError: a width without a height.
@@ -124,7 +126,7 @@ class ExportTask(Task):
             )
         size = (graph.camera.width, graph.camera.height) if self.width is None else (self.width, self.height)
         camera = reframed(graph.camera, *cast(tuple[int, int], size))
-        workers = self._processes(context)
+        workers = self._workers(context)
         psi, models = self._psi(context), models_of(graph.objects)
         stages = graph.fields if self.detail == "run" else finer_fields(graph, camera, self.largest_views)
         renderer = x.imaging.renderer if self.quality is None else x.imaging.renderer.at(self.quality)
@@ -178,10 +180,12 @@ class ExportTask(Task):
             return graph.stated_psi(self.psi, "export.psi")
         return psi_of_file(Path(self.psi).expanduser(), distribution, graph.names)
 
-    def _processes(self, context: Context) -> int:
-        on_cpu = context.graph.device.type == "cpu"
+    def _workers(self, context: Context) -> Workers:
+        on_cpu, of_run = context.graph.device.type == "cpu", context.experiment.run.workers
+        if self.workers is None and on_cpu:
+            return of_run if of_run == "ray" else len(os.sched_getaffinity(0))
         if self.workers is None:
-            return len(os.sched_getaffinity(0)) if on_cpu else 0
+            return 0
         if self.workers and not on_cpu:
             raise ValueError(f"export.workers: want 0 or null with trainer=gpu, got {self.workers}")
         return self.workers

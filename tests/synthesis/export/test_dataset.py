@@ -79,7 +79,16 @@ def test_a_set_grows_and_keeps_its_images_and_ids(boxes, whole, tmp_path):
 
 
 def test_several_processes_write_the_same_bytes(boxes, whole, tmp_path):
-    written(data_of(boxes, tmp_path / "data", workers=2, count=3))
+    _written_as_by_one(boxes, whole, tmp_path, workers=2)
+
+
+@pytest.mark.slow
+def test_a_cluster_writes_the_same_bytes(boxes, whole, tmp_path, ray_cluster):
+    _written_as_by_one(boxes, whole, tmp_path, workers="ray")
+
+
+def _written_as_by_one(boxes, whole, tmp_path, workers):
+    written(data_of(boxes, tmp_path / "data", workers=workers, count=3))
     few = contents(tmp_path / "data")
     assert all(
         content == contents(whole[0])[name] for name, content in few.items() if name.startswith("images/")
@@ -95,7 +104,7 @@ def test_what_a_worker_raises_is_raised_here(boxes, tmp_path):
     blocked = dataclasses.replace(data, root=tmp_path / "images" / "below")
     writer = module.ImageWriter(blocked.source, blocked.root, "png", None, 0.1)
     with pytest.raises(ValueError, match=r"export\.folder: .*000000\.png cannot be written"):
-        list(module.each(writer, [0], 1))
+        list(module.each(writer, [0], 1, tmp_path))
 
 
 def test_a_lost_image_is_made_again(boxes, whole, tmp_path):

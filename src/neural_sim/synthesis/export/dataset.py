@@ -14,12 +14,13 @@ from typing import Any, Literal, TypeVar, get_args
 import torch
 from PIL import Image
 
-from neural_sim.processes import processes
+from neural_sim.processes import Work, WorkersLost
 from neural_sim.synthesis.export import bop
 from neural_sim.synthesis.export.coco import coco_document
 from neural_sim.synthesis.export.folder import ExportFolder, opencv_entry, record_of, write_json, write_whole
 from neural_sim.synthesis.export.images import GOLDEN, ImageSource, spread
 from neural_sim.synthesis.export.yolo import write_yolo
+from neural_sim.workers import Workers, workers
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +76,7 @@ class DataSet:
     image_format: ImageFormat = "jpg"
     scene_size: int = 1000
     farthest: float = 6553.5
-    workers: int = 0
+    workers: Workers = 0
     val_fraction: float = 0.0
 
     def write(self, shown: Callable[[Iterable[int]], Iterable[int]]) -> list[dict[str, Any]]:
@@ -87,13 +88,13 @@ class DataSet:
         folder, with_bop = ExportFolder(self.root, self.identity), "bop" in self.formats
         scale = bop.depth_scale(self.farthest)
         writer = ImageWriter(
-            self.source, self.root, self.image_format, self.scene_size if with_bop else None, scale
+            self.source, self.root.resolve(), self.image_format, self.scene_size if with_bop else None, scale
         )
         with folder.opened() as records:
             missing = [number for number in range(self.count) if number not in records]
             if records:
                 _log.info("export: %s has %d images, %d to go", self.root, len(records), len(missing))
-            begun, made = time.perf_counter(), each(writer, missing, self.workers)
+            begun, made = time.perf_counter(), each(writer, missing, self.workers, self.root)
             try:
                 for number in shown(missing):
                     records[number] = next(made)
@@ -139,17 +140,29 @@ class DataSet:
 T = TypeVar("T")
 
 
-def each(task: Callable[[int], T], numbers: Sequence[int], workers: int) -> Generator[T, None, None]:
+def each(
+    task: Callable[[int], T], numbers: Sequence[int], by: Workers, folder: Path
+) -> Generator[T, None, None]:
     """Yield the results of ``task`` for each number, in order.
 
-    Every process computes with one torch thread, so that results do not depend on the number of processes. That number
-    is ``workers``; 0: this process alone. Each process gets the task once, so that it must be picklable.
+    Every worker computes with one torch thread, so that results do not depend on the number of workers. ``by`` is the
+    number of processes (0: this process alone) or a cluster. Each worker gets the task once, so that it must be
+    picklable; it writes to ``folder``.
+
+    Raises:
+        WorkersLost: a worker ended without a result, and its replacements did, too.
     """
-    if workers == 0:
+    if by == 0:
         yield from _here(task, numbers)
         return
-    with processes(min(workers, max(len(numbers), 1)), task, threads=1) as (pool, run):
-        yield from pool.map(run, numbers)
+    try:
+        with workers(by, len(numbers), Work(task, folder, threads=1)) as submit:
+            for made in [submit(number) for number in numbers]:
+                yield made.result()
+    except WorkersLost as lost:
+        raise WorkersLost(
+            f"export: {lost}; the same command goes on after the images that are there"
+        ) from lost
 
 
 def _here(task: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None, None]:
