@@ -3,6 +3,7 @@
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import jaxtyping
 import pytest
@@ -70,7 +71,7 @@ def ray_cluster():
     ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
-    machine = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+    machine: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))  # of the machines
         try:
@@ -81,7 +82,7 @@ def ray_cluster():
             pytest.skip(f"this machine is too busy to begin a cluster: {error}")
         for _ in range(2):
             cluster.add_node(**machine)
-        patched.setenv("RAY_ADDRESS", cluster.address)
+        patched.setenv("RAY_ADDRESS", str(cluster.address))
         yield cluster
         ray.shutdown()
         cluster.shutdown()

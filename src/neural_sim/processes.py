@@ -34,7 +34,7 @@ class Work:
     Attributes:
         task: is called with each argument. It must be picklable; a worker gets it once.
         folder: where it writes, which every worker must see.
-        threads: threads of torch's in each worker. Sums depend on their number, so results do.
+        threads: torch threads in each worker. Sums depend on their number, so results do.
         gpus: part of a GPU that an argument takes on a cluster.
     """
 

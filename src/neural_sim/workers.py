@@ -103,7 +103,7 @@ def _connected() -> Any:
 
         if not ray.is_initialized():
             address = os.environ.get("RAY_ADDRESS", "local")
-            own = {"include_dashboard": False} if address == "local" else {}
+            own: dict[str, Any] = {"include_dashboard": False} if address == "local" else {}
             try:
                 ray.init(address, log_to_driver=False, logging_level=logging.WARNING, **own)
             except Exception as error:  # Ray raises that class itself where a machine is too slow to begin
