@@ -120,3 +120,13 @@ def test_a_page_gets_a_section_for_each_family_that_was_measured(tmp_path):
     whole = json.loads((tmp_path / "numerics.json").read_text())
     assert list(whole) == ["renderer", "field"] and whole["renderer"] == markdown(held, "renderer")
     assert "    python -m src.main +experiment=work_precision\n" in text
+
+
+def test_a_page_that_has_sections_gets_no_others(tmp_path):
+    page = tmp_path / "numerics.md"
+    name = "Error against run time: field"
+    page.write_text(f"kept\n<!-- begin: {name} -->\nold\n<!-- end: {name} -->\n")
+    write_docs(document(SERIES, MACHINE), page, "python -m src.main +experiment=work_precision")
+    text = page.read_text()
+    assert "old" not in text and f"## {name}\n" in text and "renderer" not in text
+    assert list(json.loads((tmp_path / "numerics.json").read_text())) == ["renderer", "field"]

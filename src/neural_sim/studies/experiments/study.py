@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,10 +31,8 @@ from neural_sim.tasks.context import Context, Task
 
 NOT_YET = "not yet measured"
 BY_FIGURES = "figures in the run's folder"
-IN_JSON = (
-    "All tables, of every object and setting next to the paper's, and what the methods cost, are on the site "
-    "(`nox -s docs`), from `experiments.json`, and in the folder of an `experiments_table` run."
-)
+IN_JSON = "All tables, and what the methods cost, are on the site (`nox -s docs`), from `experiments.json`."
+NO_WIDTH = re.compile(r"(\S+) \(\1 to \1\)")
 COMMAND = "python -m src.main +experiment=experiments_table experiments.page=docs/experiments.md"
 
 
@@ -52,6 +51,7 @@ class Row:
         table: the paper's table that stands beside ours.
         differs: what differs from the paper's setting.
         needs: data that the project does not bring; the page says so of a row without runs.
+        elsewhere: where the documentation's page sends a reader instead of having our numbers; empty: it has them.
 
     Raises:
         ValueError: an unknown layout, one without runs, or a document besides.
@@ -67,6 +67,7 @@ class Row:
     table: str | None = None
     differs: str = ""
     needs: str = ""
+    elsewhere: str = ""
 
     def __post_init__(self) -> None:
         if self.layout is not None and (self.layout not in LAYOUTS or not self.runs or self.document):
@@ -202,15 +203,11 @@ class Experiments(Task):
         note = (
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "
-            "set, in points; brackets are 95 % intervals over seeds and test images. Where there is one seed, they "
-            "are over test images alone, and another training may differ by more (docs/results.md, The same training "
-            "again). NS is no optimisation, NSO is `baseline=neural_sim`. Line numbers are those of the "
-            "paper's LaTeX source."
+            "set, in points. Brackets are 95 % intervals over seeds and test images; of a single seed they are too "
+            "narrow (docs/results.md, The same training again). NS is no optimisation, NSO is `baseline=neural_sim`. "
+            "Line numbers are those of the paper's LaTeX source."
         )
-        written = (
-            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments, and settings in "
-            "their tables, without runs there it keeps what it said before."
-        )
+        written = f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. What has no runs there is kept."
         return ["# Experiments", written, note]
 
     def _brief(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
@@ -222,11 +219,14 @@ class Experiments(Task):
             if own is None:
                 said.append(("Ours", [row.without_runs]))
             else:
-                said.append((f"Ours, commit {', '.join(own.all_commits)}", own.summary))
+                lines = (
+                    [row.elsewhere] if row.elsewhere else [NO_WIDTH.sub(r"\1", line) for line in own.summary]
+                )
+                said.append((f"Ours, commit {', '.join(own.all_commits)}", lines))
             said.append(("What differs", [row.differs] if row.differs else []))
             points = [_point(title, lines) for title, lines in said if lines]
             parts += [f"## {row.title}", f"    {row.command_line}", "\n".join(points)]
-            if own and row.layout is None:
+            if own and row.layout is None and not row.elsewhere:
                 parts.append(_to_first_table(own.below))
             if row.table and not (own and row.layout):
                 parts.append(self._tables[row.table].markdown())
@@ -264,7 +264,11 @@ class Experiments(Task):
     def _claims(self, row: Row) -> list[str]:
         """Return what the paper says, with its source."""
         found = [claim for name in row.claims for claim in self.paper["claims"][name]]
-        texts = [f"{c['what']} {c['value']} ({c['source']}, l. {c['line']})" for c in found]
+        sources: dict[str, list[str]] = {}
+        for claim in found:
+            said = sources.setdefault(f"({claim['source']}, l. {claim['line']})", [])
+            said.append(f"{claim['what']} {claim['value']}")
+        texts = [f"{'; '.join(said)} {source}" for source, said in sources.items()]
         if row.table:
             texts.append(f"{self._tables[row.table].title}: below")
         return texts

@@ -21,6 +21,7 @@ INTRODUCTION = (
     "of the table has a smaller error in less time. MB is the most that tensors took at one time."
 )
 MACHINE = "{clock} of {processor}, torch {torch}, {threads} thread(s), load {load:.1f}."
+SECTION = "<!-- begin: Error against run time: "
 CLOCKS = {"cpu_seconds": "Processor seconds", "seconds": "Seconds on the wall"}
 Row = Mapping[str, Any]
 
@@ -239,15 +240,17 @@ def _families(held: Mapping[str, Any]) -> list[str]:
 
 
 def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
-    """Rewrite a section of ``page`` for each family, see ``neural_sim.documents.replace_section``.
+    """Rewrite the sections of ``page``, see ``documents.replace_section``; a page without any gets all families.
 
-    The page has ``brief`` tables; the whole ones go to the JSON file of the same name.
+    The page has ``brief`` tables; the whole ones, of every family, go to the JSON file of the same name.
     """
     file = page.with_suffix(".json")
+    text = page.read_text(encoding="utf-8") if page.is_file() else ""
     whole = read_json(file) if file.is_file() else {}
     for family in _families(held):
         name = f"Error against run time: {family}"
-        replace_section(page, name, f"    {command}\n\n{brief(held, family)}")
+        if f"{SECTION}{family} -->" in text or SECTION not in text:
+            replace_section(page, name, f"    {command}\n\n{brief(held, family)}")
         whole[family] = markdown(held, family)
     write_json(file, whole)
 
