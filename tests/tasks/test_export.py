@@ -12,8 +12,9 @@ import torch
 from composing import composed
 from PIL import Image
 
+from neural_sim.cameras import reframed
 from neural_sim.main import UserError, context_of
-from neural_sim.stages.detail import finer_recipe, view_size_for
+from neural_sim.stages.detail import cost_of, finer_fields, finer_recipe, view_size_for
 from neural_sim.stages.store import locked
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.target.coco import CocoTarget
@@ -224,3 +225,15 @@ def test_a_finer_recipe_has_more_steps_and_cells_and_may_be_fitted(base):
     fitting = finer.fitting(finer.field())
     assert fitting.resolution == 256
     assert torch.is_tensor(fitting.field.table)
+
+
+def test_what_finer_fields_cost_is_said_before_they_are_fitted(made, base):
+    """Nothing is to be said where the run's own fields serve."""
+    context, _ = context_of(small(base), base / "unused")
+    graph, results = context.graph, context.results
+    finer = finer_fields(graph, reframed(graph.camera, 384, 384), 192)
+    assert cost_of(finer, graph.fields, results) == (
+        "2 finer fields to fit first, with 4.0 times the steps and views of 16 times the pixels of the run's own; "
+        "export.detail=run takes those instead"
+    )
+    assert cost_of(graph.fields, graph.fields, results) == ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.views import Views
 from neural_sim.stages.field import FieldStage
 from neural_sim.stages.graph import Graph
+from neural_sim.stages.stage import Results
 from neural_sim.types import PinholeCamera
 
 _log = logging.getLogger(__name__)
@@ -90,4 +91,26 @@ def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[Fie
     made = finer_recipe(recipe, size / views.image_size)
     return tuple(
         replace(stage, recipe=made, views=replace(stage.views, settings=finer)) for stage in graph.fields
+    )
+
+
+def cost_of(finer: Sequence[FieldStage], own: Sequence[FieldStage], results: Results) -> str:
+    """Say what finer fields cost, before they are fitted.
+
+    Args:
+        finer: the fields that an export wants.
+        own: the run's own fields.
+        results: results that exist already.
+
+    Returns:
+        A sentence; empty where the store has all finer fields, or where they are the run's own.
+    """
+    missing = sum(stage in finer for stage in results.missing(finer))
+    if not missing or list(finer) == list(own):
+        return ""
+    steps = finer[0].recipe.steps / own[0].recipe.steps
+    pixels = (finer[0].views.settings.image_size / own[0].views.settings.image_size) ** 2
+    return (
+        f"{missing} finer field{'s' if missing > 1 else ''} to fit first, with {steps:.1f} times the steps and views "
+        f"of {pixels:.0f} times the pixels of the run's own; export.detail=run takes those instead"
     )

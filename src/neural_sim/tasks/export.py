@@ -24,7 +24,7 @@ from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.report.page.samples import write_samples_page
 from neural_sim.stages.describe import describe, modules_of
-from neural_sim.stages.detail import finer_fields
+from neural_sim.stages.detail import cost_of, finer_fields
 from neural_sim.stages.psi_file import psi_of_file
 from neural_sim.stages.stage import Stage
 from neural_sim.stages.store import Store, locked
@@ -144,6 +144,8 @@ class ExportTask(Task):
             **self._look(renderer, synthesis),
         }
         ExportFolder(root, identity).check()  # before fields are fitted, which may take minutes
+        if cost := cost_of(stages, graph.fields, context.results):
+            _log.info("export: %s", cost)
         for stage in context.results.free_first(context.shown(stages, "field")):
             context.results(stage)
         source = ImageSource(
