@@ -18,6 +18,7 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
 from neural_sim.outer.steps import FreeSteps, Proposal
 from neural_sim.outer.trust_region import TrustRegion
+from neural_sim.outer.way import Way
 
 
 def checked_loop(scene, iterations=3, **outer):
@@ -274,6 +275,30 @@ def test_a_loop_whose_objects_were_all_read_ends_without_a_derivative(scene, mon
     assert torch.equal(learned.last, psi.double()) and record.certificate is None
     # One training at the start, and one to judge what was proposed.
     assert record.images == 7 + 12 * (2 if psi.any() else 1)
+
+
+def test_a_reading_that_a_training_accepts_is_not_taken_back_for_less_than_trainings_scatter(
+    scene, monkeypatch
+):
+    """The object's score falls by 0.01 where it was read; the other's scatters by 0.5 between trainings."""
+    psi = torch.stack([THERE[0], torch.zeros(4)])
+    both = (*SHOWN, replace(SHOWN[0], name="b", finding="stays"))
+    met = []
+
+    def scores(trained):
+        number = next((n for n, one in enumerate(met) if one is trained), len(met))
+        met.extend([trained] * (number == len(met)))
+        return (
+            torch.tensor([-0.01 * bool(trained.psi[0].any()), 0.5 * (number % 2)])[:, None].expand(2, 6) / 6
+        )
+
+    monkeypatch.setattr(Trained, "scores", property(lambda trained: scores(trained).double()))
+    given = {"first": Fake(psi, shown=both), "refine": "unread", "steps": TrustRegion()}
+    learned = learn_psi(checked_loop(scene, 4, **given))
+    assert learned.records[-1].verdicts["a"].accepted and not learned.records[-1].taken_back
+    assert torch.equal(learned.last, psi.double())
+    monkeypatch.setattr(Way, "settled", lambda way, names: way)  # the best psi on its way is the start
+    assert "a" in learn_psi(checked_loop(scene, 4, **given)).records[-1].taken_back
 
 
 def test_what_was_read_in_part_is_not_read():

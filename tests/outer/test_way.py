@@ -71,6 +71,11 @@ def test_a_loss_that_shows_over_several_trainings_is_taken_back_object_by_object
     assert back == TakenBack(1, 2, float(values[1] - values[2])) and back.gain > 0.0
 
 
+def test_a_settled_object_cannot_go_back():
+    way = walked({"a": [(0.5, 0.52, 0.51), (0.45, 0.46)], "b": [(0.5, 0.52), (0.3, 0.29)]})
+    assert set(way.best()) == {"a", "b"} and set(way.settled(["a"]).best()) == {"b"}
+
+
 def test_the_last_psi_is_kept_where_it_is_as_good_or_scores_are_unknown():
     assert walked({"a": [(0.5, 0.5), (0.5,)], "b": [(0.9,), (math.nan,)]}).best() == {}
     assert walked({"a": [(0.9,), (0.1,)]}).best() == {}  # how far trainings scatter is not known

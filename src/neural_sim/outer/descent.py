@@ -45,7 +45,7 @@ class GradientLoop(OuterLoop, ABC):
     accepts or rejects the last step, and the last iteration does nothing else. Before the first derivative, the loop
     tries the psi that ``first`` proposes, if any; objects that it read stay there, unless the training rejected it
     (``outer.refine``). The loop ends early once no object has a significant derivative. At
-    the end every object goes back to the best psi that it has had.
+    the end every other object goes back to the best psi that it has had.
     """
 
     def __init__(
@@ -124,12 +124,17 @@ class GradientLoop(OuterLoop, ABC):
             self.psi.data[self._labels] = tried.reported
 
     def _settle(self, verdicts: Mapping[str, Verdict]) -> None:
-        """Leave the objects that the first step read where they are; if it read all of them, the loop has ended."""
+        """Leave the objects that the first step read where they are; if it read all of them, the loop has ended.
+
+        They do not go back at the end either: a pair of trainings has judged them already, and what the target's boxes
+        show is better evidence than the scatter of trainings.
+        """
         steps, rejected = self.steps, {name for name, verdict in verdicts.items() if not verdict.accepted}
         settled = read_objects(self.shown) - rejected
         if settled and isinstance(steps, TrustRegionSteps):
             self._stopped = settled >= set(self.objects.names)
             self.steps = steps.held(settled)
+            self._way = self._way.settled(settled)
 
     def _trained_once(self) -> Trained:
         """Train at psi, to record what it is worth."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -72,6 +72,10 @@ class Way:
     def moved(self, name: str, psi: Float[Tensor, "K"]) -> Way:
         """Add another psi, to which an object has moved."""
         return self._with(name, (*self.stays[name], Stay(psi.clone())))
+
+    def settled(self, names: Collection[str]) -> Way:
+        """Forget where some objects were before, so that they cannot go back there."""
+        return Way({name: stays[-1:] if name in names else stays for name, stays in self.stays.items()})
 
     def seen(self, name: str, score: float) -> Way:
         """Add the score of a training that saw an object at its present psi."""
