@@ -74,8 +74,8 @@ def main() -> None:
 
         small = [word for word in SMALL if not word.startswith(("budget.outer.iterations=", "stages="))]
         sys.argv = [
-            "neural-sim", *small, f"budget.outer.iterations={given.iterations}", "stages=[psi]",
-            f"paths.store={folder}/store", f"hydra.run.dir={folder}/run",
+            "neural-sim", *small, "baseline=neural_sim_derivative", "stages=[psi]",
+            f"budget.outer.iterations={given.iterations}", f"paths.store={folder}/store", f"hydra.run.dir={folder}/run",
         ]  # fmt: skip
         program.main()
     first, last = rows[min(WARM, len(rows) - 1)], rows[-1]
