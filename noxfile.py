@@ -8,10 +8,10 @@ nox.options.sessions = ["lint", "types", "tests"]
 
 
 def _install(session: nox.Session, editable: bool = True, many_processes: bool = False) -> None:
-    """Install the locked environment, extras included, then the project itself without resolving again.
+    """Install the locked environment with all extras, then the project itself without resolving again.
 
-    Where ``many_processes`` will import it, it is compiled once: each would otherwise take some ten seconds for that
-    wherever PYTHONDONTWRITEBYTECODE is set.
+    With ``many_processes`` the environment is compiled to bytecode up front; if PYTHONDONTWRITEBYTECODE is set, every
+    process would otherwise spend some ten seconds on compiling it.
     """
     session.install("-r", "requirements.lock", env={"UV_COMPILE_BYTECODE": "1"} if many_processes else None)
     session.install("--no-deps", *(["-e"] if editable else []), ".")
@@ -21,14 +21,14 @@ def _install(session: nox.Session, editable: bool = True, many_processes: bool =
 
 @nox.session
 def demo(session: nox.Session) -> None:
-    """Learn which poses to render for the embedded objects; takes minutes on two cores."""
+    """Learn which poses of the embedded objects to render; takes minutes on two cores."""
     _install(session)
     session.run("python", "-m", "src.main", "+experiment=pose_gap", "scale=quick", *session.posargs)
 
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """Run the fast tests, in up to four processes of one thread."""
+    """Run the fast tests in up to four single-threaded processes."""
     _install(session, many_processes=True)
     session.env["OMP_NUM_THREADS"] = "1"
     session.run(
@@ -38,7 +38,7 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def slow(session: nox.Session) -> None:
-    """Run the tests that take minutes, every documented command among them, in one process per core."""
+    """Run the tests that take minutes, including every documented command, in one process per core."""
     _install(session, many_processes=True)
     session.env["OMP_NUM_THREADS"] = "1"
     session.run("python", "-m", "pytest", "-m", "slow", "-n", "auto", "--dist", "worksteal", *session.posargs)
@@ -46,7 +46,7 @@ def slow(session: nox.Session) -> None:
 
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Check style, format and spelling; nothing of the project is imported."""
+    """Check style, format and spelling, without importing the project."""
     session.install("-c", "requirements.lock", "ruff", "codespell")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
@@ -55,7 +55,7 @@ def lint(session: nox.Session) -> None:
 
 @nox.session
 def lock(session: nox.Session) -> None:
-    """Resolve requirements.lock anew from pyproject.toml; ``nox -s lock -- --upgrade`` takes newer releases."""
+    """Regenerate requirements.lock from pyproject.toml; ``nox -s lock -- --upgrade`` moves to newer releases."""
     session.install("uv")
     session.run(
         "uv", "pip", "compile", "pyproject.toml", "--all-extras", "--group", "dev", "--universal",
@@ -65,14 +65,14 @@ def lock(session: nox.Session) -> None:
 
 @nox.session
 def types(session: nox.Session) -> None:
-    """Check static types."""
+    """Check types with pyright."""
     _install(session)
     session.run("pyright")
 
 
 @nox.session
 def docs(session: nox.Session) -> None:
-    """Build the documentation as a site in outputs/site; a warning is an error."""
+    """Build the documentation site in outputs/site; warnings are errors."""
     session.install("-r", "requirements.lock")
     session.run(
         "python", "-m", "mkdocs", "build", "--strict", *session.posargs, env={"NO_MKDOCS_2_WARNING": "1"}
@@ -81,7 +81,7 @@ def docs(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Error against run time; ``nox -s bench -- outer export`` runs benchmarks/<name>.py instead."""
+    """Measure error against run time; ``nox -s bench -- outer export`` runs benchmarks/<name>.py instead."""
     _install(session)
     for name in session.posargs:
         session.run("python", f"benchmarks/{name}.py")

@@ -1,7 +1,7 @@
-"""Fit one radiance field to photographs, score it on those held out, and render it from all around.
+"""Fit one radiance field to photographs, score it on held-out ones, and render it from all around.
 
-The folder holds photographs with their cameras (``transforms.json`` or a COLMAP model) and masks; without cameras or
-masks, ask for them to be computed:
+The folder contains photographs with cameras (``transforms.json`` or a COLMAP model) and masks. If cameras or masks are
+missing, have them computed:
 
     python examples/field_from_photographs.py my_mug turntable.png --poses colmap --masks scene
 """
@@ -29,16 +29,16 @@ from neural_sim.types import PinholeCamera
 
 
 def main() -> None:
-    """Read the photographs, fit the field, print its score and write eight of its views."""
+    """Read the photographs, fit the field, print its score and write eight renders of it."""
     parser = argparse.ArgumentParser(description="Fit one radiance field to photographs.")
-    parser.add_argument("folder", type=Path, help="of the photographs of one object")
-    parser.add_argument("picture", type=Path, help="where the rendered views go")
+    parser.add_argument("folder", type=Path, help="folder with the photographs of one object")
+    parser.add_argument("picture", type=Path, help="file to write the rendered views to")
     parser.add_argument("--poses", choices=["given", "colmap"], default="given")
     parser.add_argument("--masks", choices=["auto", "files", "alpha", "scene"], default="auto")
     parser.add_argument(
         "--size", type=int, default=160, help="side in pixels of the views that the field is fitted to"
     )
-    parser.add_argument("--steps", type=int, default=240, help="of the optimiser")
+    parser.add_argument("--steps", type=int, default=240, help="optimiser steps")
     options = parser.parse_args()
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)  # no tips
@@ -53,7 +53,7 @@ def main() -> None:
     held_out = len(source.split(name, count=84, held_out=16)[1])
     views = source.views(name, count=84, held_out=16, image_size=options.size)
 
-    # Coarse cells at first: empty ones go and the others are halved after a third of the steps.
+    # The grid starts coarse: after a third of the steps empty cells are pruned and the others halved.
     third = options.steps // 3
     fitting = GridFitting(GridField(), resolution=128, refine_steps=(third,), prune_steps=(2 * third,))
     generator = torch.Generator().manual_seed(0)
@@ -63,7 +63,7 @@ def main() -> None:
     if score < POOR:
         print(f"below {POOR:g} dB a field does not show its object: look at the masks and the photographs")
 
-    # Poses are (phi, rho, distance): 90 degrees of phi is the side of an object that stands upright.
+    # Poses are (phi, rho, distance); at phi = 90 degrees the camera looks at an upright object from the side.
     turns = torch.arange(8) * (2 * math.pi / 8)
     poses = orbit(torch.full((8,), math.radians(70.0)), turns, torch.full((8,), 3.0))
     rgb, opacity = NerfRenderer().render(field, PinholeCamera(192, 192, math.radians(45.0)), poses)

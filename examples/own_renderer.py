@@ -1,7 +1,7 @@
-"""Learn which poses to render with a renderer of your own; the psi loop is used as a library, without configuration.
+"""Learn which poses to render with your own renderer, using the psi loop as a library without configuration files.
 
-The renderer here draws cubes with painted faces. Put yours in its place: the loop asks for colour and opacity at given
-camera poses and needs no derivatives of them.
+The renderer here draws cubes with painted faces. Put yours in its place: the loop asks it for colour and opacity at
+given camera poses and needs no derivatives.
 
     python examples/own_renderer.py
 """
@@ -45,12 +45,12 @@ BINS = 8
 
 @dataclass(frozen=True)
 class PaintedCube(RenderedSubject):
-    """A cube inside the unit sphere whose six faces have colours of their own: the renderer that you would replace."""
+    """A cube inside the unit sphere with a different colour on each face: the renderer to replace with yours."""
 
-    colours: Tensor  # [6, 3], of the faces -x, -y, -z, +x, +y, +z
+    colours: Tensor  # [6, 3], colours of the faces -x, -y, -z, +x, +y, +z
 
     def maps(self, camera: PinholeCamera, camera_to_world: Tensor, weights: Tensor | None = None) -> Maps:
-        """Intersect every pixel's ray with the cube; see :meth:`RenderedSubject.maps`."""
+        """Intersect the ray of every pixel with the cube; see :meth:`RenderedSubject.maps`."""
         bundle = rays(camera, camera_to_world)
         half = 1.0 / math.sqrt(3.0)
         near = (-half * bundle.directions.sign() - bundle.origins) / bundle.directions
@@ -62,20 +62,22 @@ class PaintedCube(RenderedSubject):
 
 
 def main() -> None:
-    """Learn psi of two cubes, and print how far each was from the target's poses before and after."""
+    """Learn psi for two cubes, and print its distance from the target distribution before and after."""
     parser = argparse.ArgumentParser(description="Learn which poses to render with a renderer of your own.")
-    parser.add_argument("--iterations", type=int, default=4, help="of the psi loop")
-    parser.add_argument("--images", type=int, default=100, help="of each object in a training of the loop")
-    parser.add_argument("--steps", type=int, default=100, help="of such a training, at least")
-    parser.add_argument("--renders", type=int, default=48, help="of each object in every bin")
-    parser.add_argument("--epochs", type=int, default=15, help="of the training that the others start from")
+    parser.add_argument("--iterations", type=int, default=4, help="iterations of the psi loop")
+    parser.add_argument(
+        "--images", type=int, default=100, help="images per object in each training of the loop"
+    )
+    parser.add_argument("--steps", type=int, default=100, help="smallest number of steps in each training")
+    parser.add_argument("--renders", type=int, default=48, help="renders per object and bin")
+    parser.add_argument("--epochs", type=int, default=15, help="epochs of the warm start")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)  # no tips
     generator = torch.Generator().manual_seed(0)
 
-    # p_psi: poses in eight bins, rendered mostly from bin 7 at first. The target shows mostly bin 3, which the loop has
-    # to find from 100 labelled images of each object; `target` makes them here, in the place of photographs.
+    # p_psi has eight bins of poses and starts with most of its mass on bin 7. The target mostly shows bin 3, which the
+    # loop has to find from 100 labelled images per object; here they are drawn from `target` instead of photographed.
     distribution = SceneDistribution.of([Pose(bins=BINS, initial={"dominant": 7}, target={"dominant": 3})])
     cubes = (
         PaintedCube("warm", torch.rand(6, 3, generator=generator) * torch.tensor([1.0, 0.6, 0.4])),
@@ -86,7 +88,7 @@ def main() -> None:
     initial, target = (distribution.psi(which, scene.names) for which in ("initial", "target"))
     validation = scene.training_set(target, 100, generator).images
 
-    # Every training starts from a backbone that has learned the objects from all sides.
+    # Every training starts from a backbone that has seen the objects from all sides.
     detector = RetinaNet(len(cubes), SIZE, anchors=Anchors(sizes=((14,), (28,)), reference=SIZE))
     training = Training(batch_size=16)
     uniform = scene.training_set(torch.zeros_like(initial), 2 * options.images, generator).images
@@ -94,8 +96,8 @@ def main() -> None:
         detector, detector.init(generator), uniform, generator, training.of(options.epochs)
     )
 
-    # The first psi to try is read off the target's boxes; then the derivative of each training proposes the next. A
-    # training accepts or rejects every step, object by object.
+    # The first psi to try is estimated from the target's boxes; the derivative of each training then proposes the next.
+    # A training accepts or rejects every step, object by object.
     reading = LabelShift()
     settings = Outer(
         iterations=options.iterations,
@@ -108,7 +110,7 @@ def main() -> None:
     inner = InnerLoop.prepare(scene, inputs, settings, training, generator)
     solver = AdjointSolver(
         ConjugateGradient(), LanczosDamping()
-    )  # idle: the default derivative solves no system
+    )  # not used: the default derivative solves no linear system
     first = WhatTheTargetShows(reading)
     loop = SimulatorModule(inner, initial, StratifiedEstimator(probes_per_bin=16), solver, generator, first)
     learned = learn_psi(loop)

@@ -1,4 +1,4 @@
-"""Processes that share a command's work, and end with it."""
+"""Processes that share the work of a command and end with it."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ import torch
 from typing_extensions import override
 
 Submit = Callable[[Any], Future[Any]]
-"""Hands the task's argument to workers, and returns what will have the result."""
+"""Submits an argument of the task to the workers and returns the future of its result."""
 
 _task: Callable[[Any], Any] | None = None
 
 
 @dataclass(frozen=True)
 class Work:
-    """What workers do, whether they are processes of this machine or of a cluster's machines.
+    """What workers do, be they processes on this machine or on the machines of a cluster.
 
     Attributes:
-        task: is called with each argument. It must be picklable; a worker gets it once.
-        folder: where it writes, which every worker must see.
-        threads: torch threads in each worker. Sums depend on their number, so results do.
-        gpus: part of a GPU that an argument takes on a cluster.
+        task: function that is called with each argument. It must be picklable; each worker receives it once.
+        folder: output folder, which every worker must see.
+        threads: torch threads in each worker. Results depend on it, because the order of summation does.
+        gpus: fraction of a GPU that is reserved for each argument on a cluster.
     """
 
     task: Callable[[Any], Any]
@@ -45,17 +45,17 @@ class Work:
 
 
 class WorkersLost(ValueError):
-    """Workers were ended from outside; what they had finished stands."""
+    """Workers were killed from outside; results that they had finished are kept."""
 
 
 @contextmanager
 def processes(count: int, work: Work) -> Iterator[Submit]:
-    """Begin processes that do some work.
+    """Start processes and yield a function that submits arguments to them.
 
-    What they log appears in this process's log. Ctrl-C reaches this process alone, with which they end.
+    Their log records are passed on to the loggers of this process. They ignore Ctrl-C and end with this process.
 
     Raises:
-        WorkersLost: in place of ``BrokenProcessPool`` inside.
+        WorkersLost: replaces a ``BrokenProcessPool`` raised inside.
     """
     context = multiprocessing.get_context("spawn")
     records: Any = context.Queue()
@@ -74,7 +74,7 @@ def processes(count: int, work: Work) -> Iterator[Submit]:
 
 
 class Here(logging.Handler):
-    """Hands records of other processes to the loggers of the same names here."""
+    """Passes log records of other processes to the loggers of the same names in this one."""
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
@@ -93,7 +93,7 @@ def _begin(pickled: bytes, threads: int, records: Any, level: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process with its parent: it would wait for its next task forever."""
+    """End this process with its parent; it would wait for the next task forever otherwise."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])

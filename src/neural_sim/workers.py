@@ -1,8 +1,8 @@
-"""Who does a command's work: processes of this machine, or the machines of a Ray cluster.
+"""Workers that do the work of a command: processes on this machine, or the machines of a Ray cluster.
 
-The cluster is one of this machine's own, which ends with the command, or the one that RAY_ADDRESS names. Its machines
-have this package, and see the folder that results go to, under the same path. Work whose worker or machine is lost is
-done again by another.
+RAY_ADDRESS names the cluster; without it, a local one is started, which ends with the command. All machines of a
+cluster need this package and must see the output folder under the same path. If a worker or a machine is lost,
+another one repeats its work.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from neural_sim.processes import Here, Submit, Work, WorkersLost, processes
 Workers = int | Literal["ray"]
 """Number of processes, or a Ray cluster."""
 RETRIES = 3
-"""Times that work is done again whose worker is lost; work that ends every worker would go on for ever."""
+"""How often work is repeated after its worker was lost; limited, since some work may crash every worker."""
 
 
 @contextmanager
 def workers(kind: Workers, most: int, work: Work) -> Iterator[Submit]:
-    """Begin workers that do some work.
+    """Start workers and yield a function that submits arguments to them.
 
-    What they log appears in this process's log.
+    Their log records are passed on to the loggers of this process.
 
     Args:
-        kind: how many processes, or a cluster.
-        most: arguments that will be handed in; no more processes are begun.
-        work: what they do.
+        kind: number of processes, or a cluster.
+        most: number of arguments that will be submitted; no more processes than that are started.
+        work: what the workers do.
 
     Raises:
-        WorkersLost: work whose workers were ended from outside.
-        ValueError: a cluster that cannot be used, in one line.
+        WorkersLost: workers were killed from outside.
+        ValueError: the cluster cannot be used; the message is one line.
     """
     with _cluster(work) if kind == "ray" else processes(max(min(kind, most), 1), work) as submit:
         yield submit
@@ -82,7 +82,7 @@ def _cluster(work: Work) -> Iterator[Submit]:
 
     try:
         yield submit
-    except ray.exceptions.RayTaskError as error:  # before the task itself, or after it
+    except ray.exceptions.RayTaskError as error:  # raised outside the task itself, whose errors are results
         raise ValueError(f"workers=ray: {type(error.cause).__name__}: {first_line(error.cause)}") from error
     except ray.exceptions.RayError as error:
         raise WorkersLost(f"workers of the cluster were lost ({first_line(error)})") from error
@@ -106,7 +106,7 @@ def _connected() -> Any:
             own: dict[str, Any] = {"include_dashboard": False} if address == "local" else {}
             try:
                 ray.init(address, log_to_driver=False, logging_level=logging.WARNING, **own)
-            except Exception as error:  # Ray raises that class itself where a machine is too slow to begin
+            except Exception as error:  # Ray raises the bare class if a machine is too slow to start
                 wanted = "" if own else f" RAY_ADDRESS={address}"
                 raise ValueError(f"workers=ray:{wanted} cannot be used ({first_line(error)})") from error
     return ray
@@ -114,7 +114,7 @@ def _connected() -> Any:
 
 @dataclass(frozen=True)
 class _Place:
-    """What a worker needs to be like the process that it works for."""
+    """What a worker needs to set itself up like the process that it works for."""
 
     mark: Path
     folder: str
@@ -127,7 +127,7 @@ class _Place:
         return self.mark.name
 
     def enter(self) -> None:
-        with suppress(OSError):  # relative paths of inputs, where the folder is shared too
+        with suppress(OSError):  # inputs may have relative paths; they work if this folder is shared, too
             os.chdir(self.folder)
         if not self.mark.exists():
             raise ValueError(
@@ -140,7 +140,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Outcome:
-    """What became of one argument, and what was logged meanwhile."""
+    """Result or error for one argument, with the log records of its computation."""
 
     records: list[logging.LogRecord]
     value: Any = None
@@ -148,7 +148,7 @@ class _Outcome:
 
 
 _kept: tuple[str, Callable[[Any], Any]] | None = None
-"""The task of this process's last work, with that work's name."""
+"""Name and task of the last work that this process did."""
 
 
 def _done(place: _Place, task: list[Any], argument: Any) -> _Outcome:
@@ -168,7 +168,7 @@ def _done(place: _Place, task: list[Any], argument: Any) -> _Outcome:
 
 
 class _Records(QueueHandler):
-    """Keeps what is logged, as it can be sent."""
+    """Collects log records in a form that can be sent to another process."""
 
     def __init__(self) -> None:
         self.buffer: list[logging.LogRecord] = []
@@ -180,7 +180,7 @@ class _Records(QueueHandler):
 
 
 def _settle(result: Future[Any], outcome: Future[_Outcome]) -> None:
-    """Hand on what a process of the cluster answered, or that it was lost."""
+    """Set the result to what a worker of the cluster returned, or to the error that lost it."""
     lost = outcome.exception()
     if lost is not None:
         result.set_exception(lost)
@@ -196,7 +196,7 @@ def _settle(result: Future[Any], outcome: Future[_Outcome]) -> None:
 
 @cache
 def _code() -> str:
-    """Return a digest of this package's sources and of torch's version: results depend on both."""
+    """Return a digest of the package sources and the torch version, since results depend on both."""
     total = hashlib.sha256(torch.__version__.encode())
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         total.update(path.read_bytes())
