@@ -1,1 +1,1 @@
-"""What a user asks for: tasks, the context they run in, and a run of several of them."""
+"""Tasks that a user asks for, the context that they run in, and runs of several tasks."""

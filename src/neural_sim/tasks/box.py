@@ -1,4 +1,4 @@
-"""Task ``box``: a page on which the box about a photographed object is set by hand."""
+"""Task ``box``: a page for setting the box around a photographed object by hand."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _log = logging.getLogger(__name__)
 @validated
 @dataclass(frozen=True)
 class BoxTask(Task):
-    """A page on this machine's own address, until Ctrl-C. What it saves, ``objects.masks=scene`` reads.
+    """A page on localhost that stays open until Ctrl-C. ``objects.masks=scene`` reads the box that it saves.
 
     Args:
-        object: whose box it is; null: the only object's.
-        port: of the page; the next free one where it is taken.
-        seconds: how long it is open; null: until it is interrupted.
+        object: name of the object; null: the only one.
+        port: port of the page; if it is taken, the next free one.
+        seconds: how long the page is open; null: until Ctrl-C.
     """
 
     object: str | None = None

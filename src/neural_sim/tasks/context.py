@@ -1,4 +1,4 @@
-"""What a task runs in: the command's configuration, results of stages, a folder and MLflow."""
+"""The context of a task: configuration, results of stages, output folder and MLflow."""
 
 from __future__ import annotations
 
@@ -34,45 +34,45 @@ T = TypeVar("T")
 
 
 class TaskFailure(RuntimeError):
-    """A task has written its results, which include a failure: the program's exit status is 1."""
+    """A task wrote its results, and they report a failure; the program exits with status 1."""
 
 
 class Task(ABC):
     """An entry of ``stages``: something that a user asks for, as a frozen dataclass of its settings."""
 
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
-        """Return the stages whose results the task will read, as far as that is known before it runs.
+        """Return the stages whose results the task will read, as far as they are known before it runs.
 
-        What these would refuse is refused before any task runs; so is what this method refuses.
+        Called, and the stages checked, before any task runs, so that bad settings are refused at the start.
 
         Raises:
-            ValueError: settings of the run that the task cannot work with.
+            ValueError: the task cannot work with the settings of the run.
         """
         return ()
 
     @abstractmethod
     def run(self, context: Context) -> None:
-        """Do the work: read results, which are made where the store lacks them, and write to the run's folder."""
+        """Do the work: read results, making those that the store lacks, and write to the run's folder."""
 
 
 @dataclass
 class Context:
-    """One command: its configuration, the stages' results, its folder and its MLflow store.
+    """One command: its configuration, the results of stages, its output folder and its MLflow store.
 
     Args:
         config: the whole configuration as plain values.
-        folder: where tasks write.
-        build: makes the experiment when it is first asked for; studies of finished runs need none.
-        stages: names of what the command asks for.
-        account: seconds and what was left out, for the report.
-        live: the command's run in MLflow while it is open.
-        of_method: makes the experiment of the same command with another method (``baseline=...``), where the program
-            can compose it.
-        begun: when the task that runs began, in seconds since 1970.
-        logged: seconds by phase that the log has.
-        command: that was typed, as one line.
+        folder: output folder of tasks.
+        build: builds the experiment on first use; studies of finished runs need none.
+        stages: names of the stages and tasks that the command asks for.
+        account: time spent and work left out, for the report.
+        live: the command's MLflow run while it is open.
+        of_method: builds the experiment of the same command with another method (``baseline=...``); None if the
+            program cannot compose it.
+        begun: start of the current task, in seconds since 1970.
+        logged: seconds per phase that are in the log already.
+        command: command line as typed, on one line.
         scale: the choice of ``scale``.
-        last_words: what is printed when all tasks are done; empty: nothing.
+        last_words: text printed when all tasks are done; empty: nothing.
     """
 
     config: dict[str, Any]
@@ -90,7 +90,7 @@ class Context:
 
     @staticmethod
     def of(experiment: Experiment, folder: Path | None = None) -> Context:
-        """Return the context of an experiment that is built already, with the stages of its configuration."""
+        """Return the context of an experiment that has been built, with the stages of its configuration."""
         config = experiment.config
         return Context(config, folder or Path(), lambda: experiment, tuple(config["stages"]))
 
@@ -120,7 +120,7 @@ class Context:
             self.live.iteration(dataclasses.asdict(record))
 
     def together(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
-        """Make what the store lacks of these stages side by side, by the workers that the run has."""
+        """Make those of the stages that the store lacks in parallel, with the workers of the run."""
         wanted, run = list(stages), self.experiment.run
         if wanted:
             with self.account.charged(wanted[0].phase):
@@ -133,7 +133,7 @@ class Context:
 
     @contextmanager
     def running(self, name: str) -> Iterator[None]:
-        """Charge the seconds of a task, without those of the phases that it reads, and log those of new phases."""
+        """Charge a task for its time, except for phases whose results it reads, and log the time of new phases."""
         self.begun = time.time()
         with self.account.charged(name):
             try:
@@ -141,7 +141,7 @@ class Context:
             except OSError as error:
                 if error.filename is not None:
                     raise
-                # A disk that is full, or gone, is told without a path.
+                # Errors of a full or missing disk carry no path.
                 why, kept = error.strerror or error, "what was finished before is kept"
                 raise UserError(f"{name}: writing to {self.folder}: {why}; {kept}") from error
         for phase, spent in self.account.seconds.items():
@@ -153,7 +153,7 @@ class Context:
 
     @contextmanager
     def tracked(self) -> Iterator[None]:
-        """Open an MLflow run for what is inside, if the report is asked for."""
+        """Keep an MLflow run open meanwhile, if the report is asked for."""
         if "report" not in self.stages:
             with nullcontext():
                 yield
@@ -173,22 +173,23 @@ class Context:
         tags: Mapping[str, str] | None = None,
         title: str | None = None,
     ) -> Run | None:
-        """Write what a task found to the folder and, as a finished run, to MLflow; print the text and where it all is.
+        """Write the results of a task to the folder and to a finished MLflow run; print the text and both locations.
 
-        An MLflow store that cannot be written to costs a warning, and None is returned.
-
-        The run belongs to the experiment that the command's ``name`` names, begins when the task began, and has
-        the whole folder as its artifacts, so also what the task wrote there before. Its parameters are the whole
-        configuration, or where no experiment was built the task's own settings and the seed.
+        The MLflow run belongs to the experiment called ``name`` in the configuration and starts when the task started.
+        Its artifacts are the whole folder, including what the task wrote there before. Its parameters are the whole
+        configuration, or, if no experiment was built, the settings of the task and the seed.
 
         Args:
-            name: of the files, ``<name>.json`` and ``<name>.md``, and of the task's node in the configuration.
-            document: the content of ``<name>.json``; numbers that are not finite become null.
-            text: the content of ``<name>.md``, which is printed too; None: neither.
-            figures: written as ``figures/<key>.png``.
-            metrics: final numbers, and sequences with one value a step; None and what is not finite is left out.
-            tags: of the run in MLflow, beside the seed.
-            title: of the run in MLflow; None: its seed.
+            name: name of the files ``<name>.json`` and ``<name>.md``, and of the task's node in the configuration.
+            document: content of ``<name>.json``; numbers that are not finite become null.
+            text: content of ``<name>.md``, which is printed as well; None: no such file.
+            figures: figures by name, written to ``figures/<name>.png``.
+            metrics: final numbers, or sequences with one value per step; None and values not finite are left out.
+            tags: further tags of the MLflow run, in addition to the seed.
+            title: title of the MLflow run; None: its seed.
+
+        Returns:
+            The MLflow run, or None, with a warning, if MLflow cannot be written to.
         """
         write_json(self.folder / f"{name}.json", document)
         if text is not None:
@@ -200,7 +201,7 @@ class Context:
         known = {key: value for key, value in (metrics or {}).items() if value is not None}
         series = {key: value for key, value in known.items() if isinstance(value, Sequence)}
         numbers = {key: value for key, value in known.items() if not isinstance(value, Sequence)}
-        whole = "experiment" in self.__dict__  # built, so that the task depends on all of it
+        whole = "experiment" in self.__dict__  # it was built, so the task depends on the whole configuration
         parameters = self.config if whole else {name: self.config.get(name, {}), "seed": self.config["seed"]}
         tags, title = {"seed": seed, **(tags or {})}, title or f"seed {seed}"
         run = None
@@ -209,7 +210,7 @@ class Context:
                 run.log(numbers)
                 run.log_series(series)
                 run.log_files(self.folder)
-        except ValueError as error:  # the results are in the folder
+        except ValueError as error:  # only a warning, since the folder has the results
             _log.warning("%s; MLflow has no run of this", error)
         print(f"results: {self.folder}" + (f"\n{run.where}" if run else ""))
         return run

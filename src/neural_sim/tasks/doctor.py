@@ -1,4 +1,4 @@
-"""Task ``doctor``: whether this machine, its store and its database can do what the configuration asks for."""
+"""Task ``doctor``: check whether this machine, the store and the database are fit for the configuration."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ Health = Literal["ok", "note", "bad"]
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found. A ``note`` costs time or a feature, what is ``bad`` stops runs or spoils them.
+    """Result of one check. A ``note`` costs time or a feature; something ``bad`` stops runs or spoils their results.
 
     Attributes:
         health: ok, note or bad.
-        what: the thing that was looked at.
-        found: what it is like.
-        advice: what to do; empty where nothing is to be done.
+        what: subject of the check.
+        found: its state.
+        advice: what to do about it; empty: nothing.
     """
 
     health: Health
@@ -50,11 +50,11 @@ class Finding:
 @validated
 @dataclass(frozen=True)
 class DoctorTask(Task):
-    """Checks of packages, device, memory, OpenGL, store, database and data; exit status 1 if one of them is bad.
+    """Checks of packages, device, memory, OpenGL, store, database and data; the exit status is 1 if one is bad.
 
     Args:
-        memory_gb: free memory below which a note says so; a run at ``scale=quick`` holds 2 to 3 GB.
-        disk_gb: the same of the store's disk.
+        memory_gb: note less free memory than this; a run at ``scale=quick`` takes 2 to 3 GB.
+        disk_gb: note less free space than this on the disk of the store.
     """
 
     memory_gb: PositiveInt = 4
@@ -74,7 +74,7 @@ class DoctorTask(Task):
             raise TaskFailure(f"doctor: {', '.join(bad)}")
 
     def findings(self, context: Context) -> Iterator[Finding]:
-        """Check one thing after another; a check that fails by itself is bad."""
+        """Run one check after another; a check that raises counts as bad."""
         paths, accelerator = context.config["paths"], context.config["trainer"]["accelerator"]
         store = Path(paths["store"]).expanduser()
         checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
@@ -89,7 +89,7 @@ class DoctorTask(Task):
         for what, check in checks:
             try:
                 yield from check()
-            except Exception as error:  # whatever a broken machine raises is what was to be found
+            except Exception as error:  # whatever a broken machine raises is a finding
                 yield Finding("bad", what, first_line(error))
 
     def _memory(self) -> Iterator[Finding]:
@@ -138,7 +138,7 @@ class DoctorTask(Task):
 
 
 def packages() -> Iterator[Finding]:
-    """Compare what is installed with what the package asks for."""
+    """Compare the installed packages with the requirements of this one."""
     versions, wrong = [], []
     for text in importlib.metadata.requires("neural-sim") or []:
         requirement = Requirement(text)
@@ -170,7 +170,7 @@ def packages() -> Iterator[Finding]:
 
 
 def devices(accelerator: str) -> Iterator[Finding]:
-    """Look at the device that runs would use, the cores and torch's threads."""
+    """Check the device that runs would use, the cores and the torch threads."""
     device = device_of(accelerator)
     if device.type == "cpu" and torch.cuda.is_available():
         yield Finding("note", "device", "a GPU answers here, and runs use the CPU", "trainer=gpu")
@@ -184,7 +184,7 @@ def devices(accelerator: str) -> Iterator[Finding]:
 
 
 def opengl() -> Iterator[Finding]:
-    """Look for an OpenGL that draws without a screen."""
+    """Check for an OpenGL backend that draws without a screen."""
     backend = opengl_platform()
     if backend is None:
         yield Finding(
@@ -202,7 +202,7 @@ def database(uri: str) -> Iterator[Finding]:
             client = connect(uri)
             closed = close_abandoned(client)
             count = len(client.search_experiments())
-    except Exception as error:  # of MLflow, of its database's driver, or of the network
+    except Exception as error:  # from MLflow, the database driver or the network
         yield Finding(
             "bad", "MLflow", f"{uri}: {first_line(error)}", "mend it, move it away, or set paths.mlflow"
         )
@@ -213,7 +213,7 @@ def database(uri: str) -> Iterator[Finding]:
 
 
 def data(root: Path) -> Iterator[Finding]:
-    """Look for the folders of data sets that experiments name."""
+    """Check for the data-set folders that experiments refer to."""
     known: Sequence[str] = ("ycb", "ycb_video", "ycb_in_the_wild")
     found = [name for name in known if (root / name).is_dir()]
     if found:
@@ -232,7 +232,7 @@ def _is_installed(name: str) -> bool:
 
 
 def _free_memory_gb() -> float | None:
-    """Return the free memory, within the limit of a container (cgroup v2)."""
+    """Return the free memory, taking the limit of a container (cgroup v2) into account."""
     try:
         rows = (row.split() for row in Path("/proc/meminfo").read_text().splitlines())
         free = next(float(row[1]) * 1024 for row in rows if row[0] == "MemAvailable:")

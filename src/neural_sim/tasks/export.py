@@ -1,4 +1,4 @@
-"""Task ``export``: images drawn from a distribution, with their annotations, as a data set of any size."""
+"""Task ``export``: write a data set of annotated images drawn from a distribution, of any size."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from neural_sim.workers import Workers
 _log = logging.getLogger(__name__)
 
 UNKNOWN_RADIUS = 100.0
-"""Millimetres that stand for the radius of objects of unknown size in BOP's files."""
+"""Radius in millimetres assumed in BOP files for objects of unknown size."""
 Part = Annotated[float, Ge(0), Lt(1)]
 
 
@@ -52,25 +52,25 @@ class ExportTask(Task):
     """A data set of ``count`` images. See ``docs/use.md``, Export a data set.
 
     Args:
-        count: images. A folder that has some already gets the missing ones.
+        count: number of images. If the folder has some already, only the missing ones are added.
         psi: ``learned``, ``initial``, ``target``, or a file: a run's folder or its ``results.json`` (its learned psi),
             or the ``psi.json`` of an export.
-        width, height: in pixels; null: those of the run's synthesised images.
+        width, height: image size in pixels; null: the size of the run's synthesised images.
         formats: some of ``coco``, ``yolo`` and ``bop``.
-        val_fraction: fraction of the images for validation, which COCO and YOLO name; 0: no split.
+        val_fraction: fraction of the images for validation, for the split of COCO and YOLO; 0: no split.
         empty_fraction: fraction of the images that show no object.
-        folder: null: ``dataset`` in the run's folder.
+        folder: output folder; null: ``dataset`` in the run's folder.
         image_format: ``jpg`` (quality 95, no chroma subsampling) or ``png``.
-        quality: of the renders, ``draft``, ``normal`` or ``final``; null: the renderer's.
-        detail: ``auto`` fits finer fields to larger views where the images' size asks for it; ``run``: the
-            run's.
-        largest_views: largest side, in pixels, of the views of ``detail=auto``.
-        scene_size: images of a scene of BOP.
-        workers: processes; 0: this one alone; null: those of the run where that is a cluster, else one for each core,
-            this one alone with a GPU.
+        quality: quality of the renders, ``draft``, ``normal`` or ``final``; null: the renderer's.
+        detail: ``auto`` fits finer fields to larger views if the images are too large for the run's fields; ``run``
+            uses the run's fields.
+        largest_views: largest side, in pixels, of the views for ``detail=auto``.
+        scene_size: images per BOP scene.
+        workers: number of processes; 0: this process alone; null: the cluster if the run has one, this process alone
+            on a GPU, else one process per core.
 
     Raises:
-        ValueError: a width without a height.
+        ValueError: only one of width and height is given.
     """
 
     count: PositiveInt = 1000
@@ -143,7 +143,7 @@ class ExportTask(Task):
             **({"empty_fraction": self.empty_fraction} if self.empty_fraction else {}),
             **self._look(renderer, synthesis),
         }
-        ExportFolder(root, identity).check()  # before fields are fitted, which may take minutes
+        ExportFolder(root, identity).check()  # checked before fitting fields, which may take minutes
         if cost := cost_of(stages, graph.fields, context.results):
             _log.info("export: %s", cost)
         for stage in context.results.free_first(context.shown(stages, "field")):
@@ -158,11 +158,11 @@ class ExportTask(Task):
 
     @contextmanager
     def _taken_up(self, context: Context, data: DataSet) -> Iterator[None]:
-        """Go on with what a killed run of the same command left in a folder of its own, and note where this one works.
+        """Resume the data set of a killed run of the same command, and note in the store where this run writes.
 
-        The store's note of an unfinished data set goes when it is finished.
+        The note is removed when the data set is finished.
         """
-        if self.folder is not None:  # where it goes on anyway
+        if self.folder is not None:  # a folder that the user names is resumed in place
             yield
             return
         run, what = context.experiment.run, {"count": self.count, "formats": list(self.formats)}
@@ -193,7 +193,7 @@ class ExportTask(Task):
         return self.workers
 
     def _look(self, renderer: NerfRenderer, synthesizer: Synthesizer) -> dict[str, Any]:
-        """Return the part of an image's identity that says how it is rendered, composed and written."""
+        """Return the settings that decide how images are rendered, composed and written, for their identity."""
         described = {"renderer": describe(renderer), "synthesis": describe(synthesizer)}
         return {
             **described,
@@ -204,12 +204,12 @@ class ExportTask(Task):
 
 
 def _lock_of(root: Path) -> Path:
-    """Return the path that ``locked`` takes for a data set."""
+    """Return the path to pass to ``locked`` for a data set."""
     return root.with_name(f".{root.name}")
 
 
 def _take_up(left: Path, data: DataSet) -> None:
-    """Move an unfinished data set to where this run writes it, unless another run is at work on it."""
+    """Move an unfinished data set to this run's folder, unless another run is working on it."""
     if not (left / MANIFEST).is_file():
         return
     try:
@@ -225,7 +225,7 @@ def _take_up(left: Path, data: DataSet) -> None:
 def _rounded_probabilities(
     distribution: SceneDistribution, psi: Float[Tensor, "objects K"], names: Sequence[str]
 ) -> dict[str, dict[str, list[float]]]:
-    """Return every object's probabilities by factor."""
+    """Return the probabilities of every object, by factor."""
     p = distribution.probabilities(psi.double())
     return {
         name: {factor: [round(v, 12) for v in p[factor][label].tolist()] for factor in p}
@@ -234,9 +234,9 @@ def _rounded_probabilities(
 
 
 def models_of(objects: Objects) -> list[Model]:
-    """Return the objects in millimetres, in their meshes' frames, photographed ones in their normalised frame.
+    """Return the objects in millimetres, in the frames of their meshes or, if photographed, in their normalised frame.
 
-    Where the size of any is unknown, the radius of each counts as 100 mm, and the log says so.
+    If the size of any object is unknown, all radii are taken to be 100 mm, with a message in the log.
     """
     radii, made = objects.radii, []
     unknown = [name for name, radius in radii.items() if radius is None]

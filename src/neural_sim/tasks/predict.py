@@ -1,4 +1,4 @@
-"""Task ``predict``: a saved detector on photographs, without objects, fields or a target set."""
+"""Task ``predict``: run a saved detector on photographs, without objects, fields or a target set."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _log = logging.getLogger(__name__)
 @validated
 @dataclass(frozen=True)
 class PredictTask(Task):
-    """Detections on photographs of any size, drawn and in COCO's format, and their scores where there are annotations.
+    """Detections on photographs of any size, drawn and in COCO format, and their scores if there are annotations.
 
     Args:
-        model: a run's folder, or its ``model.safetensors``; None: the folder of this run, whose report writes it.
+        model: a run's folder, or its ``model.safetensors``; None: this run's own, written by its report.
         images: a folder, a glob or a picture.
-        annotations: a COCO file to score the detections on; None: none.
-        categories: its category names -> class names, null to leave a category out. Names not listed stand for
-            themselves.
-        draw_above: the smallest score of a box that is drawn. Results have all that the detector's own settings keep.
-        batch_size: pictures that are read at once.
+        annotations: a COCO file with ground truth; None: no scores.
+        categories: category names of that file -> class names, null to leave a category out. Categories not listed
+            are classes of the same name.
+        draw_above: smallest score of a box that is drawn. The results contain every detection of the detector.
+        batch_size: pictures per batch.
 
     Raises:
-        ValueError: no pictures, or a file that is none by its header.
+        ValueError: there are no pictures, or a file is not a picture by its header.
     """
 
     model: str | None = None
@@ -113,7 +113,7 @@ class PredictTask(Task):
 
 
 def _entry(path: Path, photos: PhotoFiles, truth: Truth | None, number: int) -> dict[str, Any]:
-    """Return COCO's entry of an image: the annotations', or a new one."""
+    """Return the COCO entry of an image: the one in the annotations, or a new one."""
     if truth is None:
         return {"id": number, "file_name": photos.name(path)}
     return {key: truth.entries[path][key] for key in ("id", "file_name")}

@@ -1,4 +1,4 @@
-"""Task ``preflight``: whether an optimisation is worth it, and how renders differ from the target otherwise."""
+"""Task ``preflight``: tell whether an optimisation is worth running, and how else renders differ from the target."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from neural_sim.tasks.context import Context, Task
 @validated
 @dataclass(frozen=True)
 class PreflightTask(Task):
-    """What to expect of an optimisation, before any.
+    """What to expect from an optimisation, before running one.
 
-    It shows the detector of the initial distribution by bin of the validation images, the expected gain of every
+    Shows the scores of the initial distribution's detector by bin of the validation images, the expected gain of every
     object and bin to first order, and how renders differ from the target.
 
     Args:
         trials: trainings whose derivatives are averaged.
-        moved: fraction of an object's images that is moved to a bin for the gains by bin.
-        labelled: numbers of labelled photographs whose gain in training is measured beside it, where the target has a
-            part for training.
+        moved: fraction of an object's images that is moved to a bin to estimate the gain of that bin.
+        labelled: numbers of labelled training photographs whose gain is measured for comparison, if the target has any
+            to train on.
     """
 
     trials: PositiveInt = 2

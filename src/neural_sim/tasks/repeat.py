@@ -1,4 +1,4 @@
-"""Task ``repeat``: the scored detectors trained again with other random numbers, and how much of the gain remains."""
+"""Task ``repeat``: retrain the scored detectors with other random numbers to see how much of the gain remains."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Task
 
 APART = 1_000
-"""Between the seeds of trainings, so that a sweep over seeds 0, 1, 2 shares none of them."""
+"""Distance between the seeds of trainings, so that runs with seeds 0, 1, 2 of a sweep share none."""
 SHOWN = (("learned", "ns"), ("matched", "learned"))
-"""Differences of a table, by which detector is ahead of which."""
+"""Differences in a table, as pairs of detectors: the first minus the second."""
 DIFFERENCES = (*SHOWN, ("matched", "ns"))
 Several = Annotated[int, Ge(2)]
 
@@ -34,15 +34,14 @@ Several = Annotated[int, Ge(2)]
 @validated
 @dataclass(frozen=True)
 class RepeatTask(Task):
-    """Detectors of the initial, the learned and the target's distribution, each trained several times.
+    """Detectors of the initial, the learned and the target distribution, each trained several times.
 
-    The first training is the run's own. The target's is left out where it is unknown or where the run starts at it.
-    Fields, psi and test images stay as they are. Where some of the photographs train too, each training chooses its
-    own.
+    The first training is the run's own. The target distribution is left out if it is unknown or if the run starts from
+    it. Fields, psi and test images do not change. If a subset of photographs trains too, each training chooses its own.
 
     Args:
-        trainings: of each distribution.
-        draws: of the bootstrap over test images.
+        trainings: number of trainings on each distribution.
+        draws: bootstrap draws over test images.
     """
 
     trainings: Several = 5
@@ -77,7 +76,7 @@ class RepeatTask(Task):
 
 
 def groups(names: Sequence[str], biased: Container[str], shown: Sequence[str]) -> list[list[str]]:
-    """Return the objects that a run is about, all objects, and each one, without those that no test image shows."""
+    """Return groups of objects that test images show: the biased ones, all of them, and each one alone."""
     known = [name for name in names if name in shown]
     about = [name for name in known if name in biased]
     found: list[list[str]] = []
@@ -88,14 +87,14 @@ def groups(names: Sequence[str], biased: Container[str], shown: Sequence[str]) -
 
 
 def sentence(scores: ScoreTable, score: Score) -> str:
-    """Return the verdict on the learned distribution, after several trainings."""
+    """Return the verdict on the learned distribution over several trainings."""
     trainings = scores.point.shape[1]
     text = verdict(Gain.of(scores), score, trainings)
     return f"After {trainings} trainings of each distribution: {text}"
 
 
 def table(found: Sequence[ScoreTable], score: Score) -> str:
-    """Return a Markdown table with a row a group, in points; differences whose interval leaves 0 out are in bold."""
+    """Return a Markdown table with one row per group, in points; differences whose interval excludes 0 are bold."""
     which = found[0].detectors
     differences = [(a, b) for a, b in SHOWN if {a, b} <= set(which)]
     head = [
@@ -126,7 +125,7 @@ def table(found: Sequence[ScoreTable], score: Score) -> str:
 
 
 def group_document(scores: ScoreTable) -> dict[str, Any]:
-    """Return a group's part of repeat.json; scores are fractions."""
+    """Return the entry of a group in repeat.json; scores are fractions."""
     which, scatter = scores.detectors, scores.scatter()
     pairs = [(a, b) for a, b in DIFFERENCES if {a, b} <= set(which)]
     return {
@@ -140,7 +139,7 @@ def group_document(scores: ScoreTable) -> dict[str, Any]:
 
 
 def again(stage: ScoresStage, training: int) -> ScoresStage:
-    """Return the same scores of a detector with other random numbers; training 0 is the run's."""
+    """Return the same scores for a detector trained with other random numbers; training 0 is the run's own."""
     return replace(stage, trained=_seeded(stage.trained, APART * training))
 
 

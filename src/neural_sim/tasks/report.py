@@ -1,4 +1,4 @@
-"""Task ``report``: the page, figures, the final training set, psi as a table, results.json, MLflow."""
+"""Task ``report``: write the page, figures, the final training set, psi as a table and results.json, also to MLflow."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ReportTask(Task):
-    """All that a run leaves in its folder and in MLflow."""
+    """The final results of a run, in its folder and in MLflow."""
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
@@ -50,7 +50,7 @@ class ReportTask(Task):
             results(stage)
         scores = {called: results(stage) for called, stage in graph.compared(learned).items()}
         report = run_results(context, scores)
-        write_results(report, folder)  # first of all: whatever fails then, the numbers are there
+        write_results(report, folder)  # first, so that the numbers are there whatever fails later
         rendered = graph.synthetic(learned.last, "learned").images(results)
         drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
         shown = _shown(context, learned.last, test, scores)
@@ -72,7 +72,7 @@ class ReportTask(Task):
 
 
 def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str, Scores]) -> Shown:
-    """Return a few images before and after, drawn with the same random numbers, and detections, for the page."""
+    """Return the pictures of the page: images before and after, drawn with the same random numbers, and detections."""
     graph, scene = context.graph, context.results(context.graph.scene)
     before, after = (
         scene.training_set(each, max(PER_OBJECT.values()), graph.warm_start.generator()).images.to("cpu")
@@ -83,13 +83,13 @@ def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str
 
 
 def _psi_table(context: Context, psi: Psi) -> str:
-    """Return the learned distribution as CSV, as an export has it."""
+    """Return the learned distribution as CSV, in the format of an export."""
     distribution = context.experiment.imaging.distribution
     return psi_csv(psi_rows(distribution, psi, context.graph.names))
 
 
 def _commands(context: Context) -> dict[str, str]:
-    """Return what to run next, by what it does."""
+    """Return commands to run next, by what they do."""
     name, folder = context.config["name"], context.folder
     return {
         "To compare methods and seeds": f"python -m src.main +experiment=compare 'compare.experiments=[{name}]'",
@@ -99,9 +99,9 @@ def _commands(context: Context) -> dict[str, str]:
 
 
 def _write_model(context: Context, test: LabelledImages) -> None:
-    """Write the detector that was scored as ``learned`` to the folder, and to MLflow where that is asked for.
+    """Write the detector that was scored as ``learned`` to the folder, and to MLflow if asked for.
 
-    One whose settings have no JSON is left out with a warning.
+    A detector whose settings cannot be written as JSON is left out with a warning.
     """
     graph, results, wanted = context.graph, context.results, context.experiment.model
     stage = graph.trained_on(results(graph.learned).last, "learned")
@@ -120,7 +120,7 @@ def _write_model(context: Context, test: LabelledImages) -> None:
 
 
 def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool = True) -> RunResults:
-    """Gather what there is to report; without ``symmetric`` the bins that look the same are left out."""
+    """Gather the results to report; without ``symmetric``, bins that look the same are not listed."""
     x, graph, results = context.experiment, context.graph, context.results
     distribution, learned = x.imaging.distribution, results(graph.learned)
     psi = {"initial": graph.psi("initial"), "learned": learned.last, "target": graph.target_psi}
@@ -164,7 +164,7 @@ def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool 
 
 
 def _real(context: Context) -> dict[str, Any]:
-    """Return how photographs trained; empty where none did."""
+    """Return how photographs were used in training; empty if they were not."""
     real = context.experiment.training.real
     if not real.used:
         return {}
@@ -185,7 +185,7 @@ def _curve(context: Context) -> list[dict[str, Any]]:
 
 
 def _identity(context: Context) -> dict[str, Any]:
-    """Return what says which runs this one can be compared with."""
+    """Return the identity that decides which runs this one can be compared with."""
     graph, imaging = context.graph, context.experiment.imaging
     sources: dict[str, Any] = {"background": imaging.synthesis.background}
     if imaging.synthesis.distractors.used:

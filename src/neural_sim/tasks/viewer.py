@@ -24,13 +24,14 @@ from neural_sim.tasks.context import Context, Task
 @validated
 @dataclass(frozen=True)
 class ViewerTask(Task):
-    """A page on this machine's own address, until Ctrl-C. Fields and the detector are read from the store, or computed.
+    """A page on localhost that stays open until Ctrl-C. Fields and the detector are read from the store, or computed.
 
     Args:
-        psi: what is shown first and what the detector was trained on: ``initial``, ``target``, ``learned`` (of a run of
-            the same configuration), or a file: a run's folder, its ``results.json``, or an export's ``psi.json``.
-        port: of the page; the next free one where it is taken.
-        seconds: how long it is open; null: until it is interrupted.
+        psi: distribution that is shown first and that the detector was trained on: ``initial``, ``target``, ``learned``
+            (by a run of the same configuration), or a file: a run's folder, its ``results.json``, or an export's
+            ``psi.json``.
+        port: port of the page; if it is taken, the next free one.
+        seconds: how long the page is open; null: until Ctrl-C.
     """
 
     psi: str = "initial"
@@ -57,7 +58,7 @@ class ViewerTask(Task):
         """Return the scene, the known distributions, and the detector trained on ``psi``.
 
         Raises:
-            ValueError: a psi that is not in the file.
+            ValueError: the file does not contain psi.
         """
         graph, known, results = context.graph, self._known(context), context.results
         if self.psi == "learned":

@@ -1,4 +1,4 @@
-"""A run: what ``stages=[...]`` names, one after another, with everything that it needs."""
+"""A run: the phases and tasks that ``stages=[...]`` lists, in order, with everything that they need."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Phase(Task):
-    """A phase of a run: results that are known before it begins.
+    """A phase of a run, consisting of stages that are known before it starts.
 
     Args:
-        name: of the phase.
-        stages: those whose results it consists of.
-        log: writes a result to MLflow.
+        name: name of the phase.
+        stages: returns the stages whose results the phase consists of.
+        log: logs a result to MLflow.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Phase(Task):
 
 @dataclass(frozen=True)
 class FieldPhase(Phase):
-    """The fields, and a page that says whether they show their objects."""
+    """The phase that fits the fields and writes a page that says whether they show their objects."""
 
     @override
     def run(self, context: Context) -> None:
@@ -120,17 +120,17 @@ PHASES: Mapping[str, Task] = {
     "evaluate": EvaluateTask(),
     "report": ReportTask(),
 }
-"""The phases of a run from objects to a report, in their order."""
+"""The phases of a run from objects to a report, in order."""
 
 
 def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
-    """Run tasks in their order; results that the store lacks are made when a task first asks for them.
+    """Run tasks in order; results that the store lacks are made when a task first asks for them.
 
-    What the tasks will read, as far as they know it, is checked before anything is made.
+    Stages that the tasks know they will read are checked before anything is made.
 
     Returns:
-        What a sweep may maximise: the AP on validation images of the detector trained on the learned distribution.
-        None where nothing was evaluated.
+        The objective for a sweep to maximise: the score on validation images of the detector trained on the learned
+        distribution. None if nothing was evaluated.
     """
     phases = PHASES.keys() & tasks.keys()
     if phases:
@@ -155,14 +155,14 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
         print(context.last_words)
     if not {"evaluate", "report"} & phases:
         return None
-    # val steered psi too: a score to choose settings by, never one to report. Nothing of test is in it.
+    # Psi was learned on val, so this score is for choosing settings, never for reporting. It uses no test images.
     return context.results(context.graph.validation(context.results(context.graph.learned))).ap.mean
 
 
 def forecast(context: Context, phases: Collection[str]) -> str:
-    """Say what phases took the last time that a run of this name, scale and method made them; empty if none did.
+    """Say how long phases took in the last run of this name, scale and method; empty if there is none.
 
-    What that run found in the store counts as long as it took when it was made.
+    Results that this run found in the store count with the time that they took to compute.
     """
     files = sorted(context.folder.parent.glob("*/results.json"), key=lambda path: -path.stat().st_mtime)
     alike = {"scale": context.scale, "method": context.experiment.loop.method.name}
@@ -175,7 +175,7 @@ def forecast(context: Context, phases: Collection[str]) -> str:
             for found in held["left_out"]:
                 if found["stage"] in spent:
                     spent[found["stage"]] += found["seconds"] or 0.0
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):  # an older version wrote it
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):  # a file of an older version
             continue
         if all(spent.values()):
             return f": about {duration(sum(spent.values()))}, as on {held['date']}" if spent else ""
@@ -183,7 +183,7 @@ def forecast(context: Context, phases: Collection[str]) -> str:
 
 
 def warn_of_uncovered(graph: Graph) -> None:
-    """Name the bins that no photograph is near: a field shows debris where no photograph looked."""
+    """Warn of bins without a photograph nearby: a field shows debris where no photograph looked."""
     distribution = graph.experiment.imaging.distribution
     for name, factors in graph.experiment.imaging.coverage.items():
         for factor, found in factors.items():
@@ -200,11 +200,11 @@ def warn_of_uncovered(graph: Graph) -> None:
 
 
 def omitted(graph: Graph, learns: bool) -> list[Omission]:
-    """Return the work that a run leaves out because its scene does not need it; the log says so too.
+    """Return the work that a run leaves out because it is not needed, and log it.
 
     Args:
-        graph: of the run.
-        learns: whether it comes to psi at all.
+        graph: stages of the run.
+        learns: whether the run learns psi at all.
     """
     x, draws = graph.experiment, graph.learned.draws
     method, outer, distribution = x.loop.method, x.loop.outer, x.imaging.distribution
