@@ -1,4 +1,4 @@
-"""What a run cost by its phases, and the work that it did not have to do."""
+"""Time that a run spent on each phase, and work that it left out."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Omission:
         stage: the phase of the run that would do it.
         what: the work.
         why: the reason.
-        fraction: of all work of that kind, None if unknown.
-        seconds: what it would take, None if unknown.
+        fraction: its share of all work of that kind, None if unknown.
+        seconds: time that it would take, None if unknown.
     """
 
     stage: str
@@ -29,10 +29,10 @@ class Omission:
 
 @dataclass
 class Account:
-    """Seconds by phase of a run, and what was left out.
+    """Seconds by phase of a run, and the work that was left out.
 
-    A phase is charged for the time between beginning and end without that of the phases inside it: a field counts as
-    a field whoever asks for it.
+    A phase is charged for the time from its start to its end, excluding the phases inside it: time spent on a field
+    counts for the field, whichever phase asks for it.
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
@@ -42,7 +42,7 @@ class Account:
 
     @contextmanager
     def charged(self, phase: str) -> Iterator[None]:
-        """Charge the time inside to a phase."""
+        """Charge a phase for the time spent inside this context."""
         self._settle()
         self._running.append(phase)
         try:
@@ -59,5 +59,5 @@ class Account:
         self._since = now
 
     def reused(self, phase: str, what: str, seconds: float) -> None:
-        """Note a result that the store had, and the seconds that it took when it was computed."""
+        """Record a result found in the store, with the seconds that it took to compute."""
         self.left_out.append(Omission(phase, what, "found in the store", 1.0, seconds))

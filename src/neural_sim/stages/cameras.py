@@ -1,4 +1,4 @@
-"""What photographs need before they become views: their cameras, where these are found, and computed masks."""
+"""Stages that prepare photographs for views: cameras found by structure from motion, and computed masks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MasksOfFrames = tuple[Float[Tensor, "_ _"], ...]
 
 
 class _StoredMasks(Stage[MasksOfFrames]):
-    """Masks of an object's photographs, in the store with 8 bits."""
+    """Masks of the photographs of an object, stored with 8 bits."""
 
     phase: ClassVar[str] = "views"
     keep: ClassVar[bool] = False  # large, read once
@@ -41,10 +41,10 @@ class _StoredMasks(Stage[MasksOfFrames]):
 
 @dataclass(frozen=True)
 class CommandMasksStage(_StoredMasks):
-    """Masks that another program makes of all photographs of an object.
+    """Masks that another program computes for all photographs of an object.
 
     Args:
-        object: its name.
+        object: name of the object.
         content: digest of its photographs.
         command: the program.
         source: the photographs.
@@ -69,17 +69,17 @@ class CommandMasksStage(_StoredMasks):
 
 @dataclass(frozen=True)
 class CamerasStage(Stage[FoundCapture]):
-    """The cameras of an object's photographs, found from the photographs.
+    """The cameras of an object's photographs, computed from the photographs.
 
-    The run's seed has no part in them, so that runs share cameras.
+    They do not depend on the run's seed, so that runs share them.
 
     Args:
-        object: its name.
-        content: digest of the photographs, and of masks and their options.
-        finder: what finds cameras.
+        object: name of the object.
+        content: digest of the photographs, the masks and their options.
+        finder: method that finds the cameras.
         source: the photographs.
-        masks: of a command, which may say where the object is.
-        progress: whether to show a bar.
+        masks: masks computed by a command, which may show where the object is.
+        progress: whether to show a progress bar.
     """
 
     phase: ClassVar[str] = "views"
@@ -141,14 +141,14 @@ def _lens(stored: list[Any]) -> Lens:
 
 @dataclass(frozen=True)
 class MasksStage(_StoredMasks):
-    """Masks of an object's photographs from the geometry of their scene, one for each that has a camera.
+    """Masks computed from the geometry of the scene, one for each photograph of an object that has a camera.
 
-    The run's seed has no part in them, so that runs share masks.
+    They do not depend on the run's seed, so that runs share them.
 
     Args:
-        object: its name.
-        content: digest of the capture's files and options.
-        scene: the source's, with its budget.
+        object: name of the object.
+        content: digest of the files and options of the capture.
+        scene: maker of masks, with its budget.
         source: the captures.
     """
 
@@ -170,19 +170,20 @@ class MasksStage(_StoredMasks):
 
 
 def command_masks(source: Photos, name: str) -> CommandMasksStage | None:
-    """Return the stage of an object's masks by a command, None where there is none."""
+    """Return the stage that computes an object's masks by a command, None if no command is set."""
     if source.command is None:
         return None
     return CommandMasksStage(name, source.found_digest(name), source.command, source)
 
 
 def with_cameras(source: Photos, results: Results, progress: bool = False) -> Photos:
-    """Return photographs with their cameras, which are found where they are not given.
+    """Return photographs with their cameras, which are computed if they are not given.
 
-    All else depends on them, from which bins photographs show to how many photographs there are: they come first.
+    Cameras come first because everything else depends on them, such as which bins photographs show and how many
+    photographs can be used.
 
     Raises:
-        ValueError: photographs whose cameras cannot be found.
+        ValueError: the cameras of some photographs cannot be found.
     """
     finder = source.poses
     if finder is None:

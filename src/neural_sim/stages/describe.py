@@ -1,4 +1,4 @@
-"""Settings as plain JSON for keys: what an object was constructed with, and the modules whose code it runs."""
+"""Describe settings as plain JSON for keys: constructor arguments of objects, and the modules whose code they run."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def describe(value: Any) -> Any:
     """Return a JSON tree that is equal for equal settings.
 
     Takes scalars, sequences, mappings, tensors, paths, partial calls, classes and functions. Other objects are
-    described by their class, their ``digest()`` if they have one (sources of files do), and what they were constructed
-    with: the fields of a dataclass, or the attributes that bear the names of the constructor's arguments.
+    described by their class, their ``digest()`` if they have one (sources of files do), and their constructor
+    arguments: the fields of a dataclass, or the attributes named like the arguments.
 
     Raises:
-        TypeError: a value of any other kind; a key must not depend on an object's address.
+        TypeError: a value of any other kind; a key must not depend on the address of an object.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -55,7 +55,7 @@ def describe(value: Any) -> Any:
 
 
 def _arguments(kind: type) -> list[str]:
-    """Return the names of a constructor's arguments, none where it does not tell."""
+    """Return the argument names of a constructor; none if it has no signature."""
     try:
         return list(inspect.signature(kind).parameters)
     except ValueError:

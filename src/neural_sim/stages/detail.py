@@ -1,4 +1,4 @@
-"""Finer fields for larger images: views with as many pixels as the images show, and grids with as many cells."""
+"""Finer fields for larger images: views at the resolution of the images, and grids to match."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from neural_sim.types import PinholeCamera
 _log = logging.getLogger(__name__)
 
 ENOUGH = 1.25
-"""Images that show at most so many pixels for one of the views' are served by the run's own fields."""
+"""The run's own fields serve images with up to this many times the resolution of their views."""
 
 
 def view_size_for(
     views: Views, camera: PinholeCamera, distribution: SceneDistribution, largest_radius: float
 ) -> int:
-    """Return the side in pixels of views that resolve at their nearest what ``camera`` does.
+    """Return the side in pixels at which the closest views resolve as much as ``camera`` does.
 
-    The camera is taken at its nearest and at its longest focal length. ``largest_radius`` is the objects', in the unit
-    of the distribution's distances.
+    The camera is taken at its smallest distance and longest focal length. ``largest_radius`` is the radius of the
+    largest object, in the unit of the distribution's distances.
     """
     drawn = {factor.coordinate: factor for factor in distribution.binned}
     nearest = drawn["distance"].low if "distance" in drawn else distribution.ranges["distance"][0]
     longest = drawn["magnification"].high if "magnification" in drawn else 1.0
-    wanted = focal_length(camera) * longest * largest_radius / nearest  # pixels for a radius
-    seen = focal_length(views.camera(1)) / views.distance_range[0]  # by each pixel of the views' side
+    wanted = focal_length(camera) * longest * largest_radius / nearest  # pixels per radius
+    seen = focal_length(views.camera(1)) / views.distance_range[0]  # the same for views of one pixel
     return math.ceil(wanted / seen)
 
 
 def finer_recipe(recipe: FieldRecipe, factor: float) -> FieldRecipe:
     """Return the recipe for views with ``factor`` times as many pixels along each side.
 
-    It has as many times the steps, and as many times the cells of a grid as the nearest power of two. The number of
-    halvings stays.
+    Steps are multiplied by the factor, and the cells of a grid along each side by the power of two nearest to it. The
+    number of refinements does not change.
     """
     fitting: Callable[..., Any] = recipe.fitting
     steps = math.ceil(recipe.steps * factor)
@@ -55,9 +55,7 @@ def finer_recipe(recipe: FieldRecipe, factor: float) -> FieldRecipe:
             for key in ("refine_steps", "prune_steps")
             if key in given
         }
-        cells = given["resolution"] * 2 ** round(
-            math.log2(factor)
-        )  # a power of two, as the visual hull wants
+        cells = given["resolution"] * 2 ** round(math.log2(factor))  # the visual hull needs a power of two
         fitting = functools.partial(fitting.func, *fitting.args, **{**given, **scaled, "resolution": cells})
     return replace(recipe, fitting=fitting, steps=steps)
 

@@ -1,4 +1,4 @@
-"""Trained detectors: on images of one distribution, with or without photographs, or on photographs alone."""
+"""Stages of detectors trained on images of one distribution, with or without photographs, or on photographs alone."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class TrainedDetector:
-    """Parameters, and the cost of rendering and training, without that of the fields, which all methods use."""
+    """Parameters, and the cost of rendering and training. Fields are excluded, since all methods use them."""
 
     params: Parameters
     cost: Cost
 
 
 class TrainedStage(Stage[TrainedDetector]):
-    """A trained detector of the classes ``names``, for images of ``camera``."""
+    """A trained detector of the classes ``names``, for images taken by ``camera``."""
 
     kind: ClassVar[str] = "detector"
 
@@ -52,21 +52,21 @@ class TrainedStage(Stage[TrainedDetector]):
     @property
     @abstractmethod
     def names(self) -> tuple[str, ...]:
-        """Of the classes, in the order of labels."""
+        """Names of the classes, in label order."""
 
     @property
     @abstractmethod
     def camera(self) -> PinholeCamera:
-        """Of the images."""
+        """Camera of the images."""
 
     def build(self) -> Detector:
-        """Return the detector's shape, without parameters."""
+        """Return the detector, without parameters."""
         camera = self.camera
         return self.detector(num_classes=len(self.names), image_size=(camera.height, camera.width))
 
     @override
     def check(self) -> None:
-        self.build()  # refuses initial weights that are missing or do not fit
+        self.build()  # raises if initial weights are missing or do not fit
 
     @override
     def pack(self, value: TrainedDetector) -> dict[str, Any]:
@@ -81,9 +81,9 @@ class TrainedStage(Stage[TrainedDetector]):
 class DetectorStage(TrainedStage):
     """A detector trained from scratch on images drawn from psi, with the same budget for every method.
 
-    ``probabilities`` is the digest of p, see ``SceneDistribution.digest_of``; ``phase`` is that of the run which
-    needs the detector, ``called`` describes psi in messages. ``targets`` are the sets whose photographs train too,
-    where ``training.real`` combines both (None: it does not).
+    ``probabilities`` is the digest of p, see ``SceneDistribution.digest_of``; ``phase`` is the phase of the run that
+    needs the detector, ``called`` describes psi in messages. ``targets`` are the target sets whose photographs are
+    mixed into the training if ``training.real`` says so, else None.
     """
 
     scene: TrainingImagesStage
@@ -114,24 +114,24 @@ class DetectorStage(TrainedStage):
         return self.scene.camera
 
     def photographs(self, results: Results) -> LabelledImages | None:
-        """Return those that train with the drawn images, None without any."""
+        """Return the photographs that train together with the drawn images, None if there are none."""
         if self.targets is None:
             return None
         return self.training.real.chosen(results(self.targets).train, self.seed)
 
     def images(self, results: Results, generator: torch.Generator | None = None) -> RenderedImages:
-        """Return the training images, equal in every call."""
+        """Return the training images, the same in every call."""
         generator = self.generator() if generator is None else generator
         scene: TrainingImages = results(self.scene)
         return scene.training_set(self.psi, self.training.images_per_object, generator)
 
     def generator(self) -> torch.Generator:
-        """Of images, new parameters and the order of training."""
+        """Return the generator of images, initial parameters and the order of training."""
         return stream(self.seed, "detector")
 
     @override
     def make(self, results: Results) -> TrainedDetector:
-        results(self.scene)  # so that fields are not charged
+        results(self.scene)  # made before the clock starts, so that the cost excludes the fields
         detector, training, generator = self.build(), self.training, self.generator()
         begun, cpu_begun = time.perf_counter(), time.process_time()
         images, sampling = self.images(results, generator).images.to(self.device), None
@@ -164,10 +164,10 @@ class DetectorStage(TrainedStage):
 
 @dataclass(frozen=True)
 class PhotographsStage(TrainedStage):
-    """A detector trained on photographs of the target: from scratch (``start`` None), or a fine-tuned one.
+    """A detector trained on photographs of the target: from scratch (``start`` None), or fine-tuned from ``start``.
 
-    ``epochs`` of ``steps`` steps each are at most so many photographs a batch as ``training`` says, in shuffled passes
-    over them.
+    There are ``epochs`` epochs of ``steps`` steps, in shuffled passes over the photographs. Batches have the size in
+    ``training``, or all photographs if there are fewer.
     """
 
     phase: ClassVar[str] = "evaluate"

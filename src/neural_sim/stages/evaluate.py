@@ -1,4 +1,4 @@
-"""Stage ``evaluate``: what detectors trained on a distribution score on target images."""
+"""Stage ``evaluate``: scores of trained detectors on target images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Scores:
-    """Average precision or accuracy on a part of the target set, and every image's detections."""
+    """Average precision or accuracy on a part of the target set, and the detections in every image."""
 
     ap: TestScore
     detections: list[dict[str, Tensor]]
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ScoresStage(Stage[Scores]):
-    """A detector's scores on ``part`` of the target sets."""
+    """Scores of a detector on ``part`` of the target sets."""
 
     phase: ClassVar[str] = "evaluate"
     kind: ClassVar[str] = "evaluate"

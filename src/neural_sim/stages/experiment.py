@@ -1,4 +1,4 @@
-"""A run as it was asked for: its parts, built and validated."""
+"""The parts of a run as configured, built and validated."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from neural_sim.types import PinholeCamera
 from neural_sim.workers import Workers
 
 SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
-"""What a task's detectors are scored by."""
+"""Score of the detectors, by task."""
 _OBJECTIVES = {"AP": ("smooth_ap", SmoothAP), "accuracy": ("smooth_accuracy", SmoothAccuracy)}
-"""What the psi loop may lower of a detector with this score, other than its loss: the group's choice, and its class."""
+"""Objective of the psi loop, other than the loss, for detectors with each score: choice in the group, and class."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a run is called and where it works.
+    """Name, seed, paths and resources of a run.
 
-    ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of ``SCORES``; with ``resume``
-    unfinished work of killed runs is taken up. ``workers`` make independent results side by side; on a cluster each
-    takes ``worker_gpus`` of a GPU.
+    ``score_at`` are fractions of a method's iterations, in (0, 1]; ``task`` is one of ``SCORES``; with ``resume``,
+    unfinished work of killed runs is resumed. ``workers`` make independent results in parallel; on a cluster, each
+    result takes the fraction ``worker_gpus`` of a GPU.
 
     Raises:
-        UserError: several processes on a GPU.
-        ValueError: a cluster without Ray.
+        UserError: several processes would share a GPU.
+        ValueError: a cluster is asked for, and Ray is not installed.
     """
 
     name: str
@@ -75,19 +75,19 @@ class Run:
 
     @property
     def gpus(self) -> float:
-        """Part of a GPU that a result takes on a cluster."""
+        """Fraction of a GPU that each result takes on a cluster."""
         return 0.0 if self.accelerator == "cpu" else self.worker_gpus
 
 
 @dataclass(frozen=True)
 class Imaging:
-    """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target.
+    """Settings of all images: of objects (``views``, ``field``, ``renderer``, ``synthesis``) and of the target.
 
-    ``camera`` is that of synthesised and of rendered target images. ``coverage`` says by object and factor what
-    photographs show; nothing is said of meshes.
+    ``camera`` takes the synthesised images and, if they are rendered, the target images. ``coverage`` says by object
+    and factor which bins photographs show; it has no entries for meshes.
 
     Raises:
-        ValueError: fields that the renderer cannot draw.
+        ValueError: the renderer cannot draw these fields.
     """
 
     objects: MeshSource | Photos
@@ -108,7 +108,7 @@ class Imaging:
 
 @dataclass(frozen=True)
 class Loop:
-    """What moves psi. ``gradient`` and ``solver`` serve methods that follow the hypergradient."""
+    """The method that learns psi. ``gradient`` and ``solver`` are for methods that follow the hypergradient."""
 
     method: Method
     outer: Outer
@@ -120,13 +120,13 @@ class Loop:
 class Experiment:
     """All parts of a run.
 
-    ``config`` is the configuration that they were built from, for reports alone, ``model`` what the report writes of
-    the final detector.
+    ``config`` is the configuration that they were built from, used in reports only; ``model`` says which files the
+    report writes for the final detector.
 
     Raises:
-        ValueError: a detector, an objective or images that are not of the task; a first hypergradient at a warm start
-            of another distribution than psi's; a method that compares trainings of which each goes on from the one
-            before.
+        ValueError: the detector, the objective or the images do not fit the task; the first hypergradient is taken at a
+            warm start on another distribution than the initial psi; or the method compares trainings, and each
+            continues from the one before.
     """
 
     run: Run
@@ -175,10 +175,10 @@ class Experiment:
 
     @property
     def score(self) -> Score:
-        """What its detectors are scored by."""
+        """The score of the detectors."""
         return score_of(self.detector)
 
     def check_boxes(self, key: str) -> None:
-        """Raise ``ValueError`` where there is no AP; ``key`` is the task that wants it."""
+        """Raise ``ValueError`` if detectors are not scored by AP, which the task ``key`` needs."""
         if self.score != "AP":
             raise ValueError(f"{key} compares boxes: want task=detection, got task={self.run.task}")

@@ -17,31 +17,31 @@ from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.views import ViewsStage
 
 EVERY = 60.0
-"""Seconds of fitting from one checkpoint to the next."""
+"""Seconds between checkpoints of a fit."""
 
 
 @dataclass(frozen=True)
 class FittedField:
-    """A field and its scores on held-out views against steps and seconds."""
+    """A field, and the history of its scores on held-out views over steps and seconds."""
 
     field: RadianceField
     history: list[dict[str, Any]]
 
     @property
     def psnr(self) -> float | None:
-        """PSNR in dB on the object's pixels of the held-out views; None without any."""
+        """PSNR in dB over the object's pixels in held-out views; None without held-out views."""
         value = self.history[-1]["psnr_foreground"] if self.history else float("nan")
         return None if math.isnan(value) else value
 
     @property
     def poor(self) -> bool:
-        """Whether the field does not show its object."""
+        """Whether the PSNR is too low for the field to show its object."""
         return self.psnr is not None and self.psnr < POOR
 
 
 @dataclass(frozen=True)
 class FieldStage(Stage[FittedField]):
-    """The field that ``recipe`` fits to all views but the held-out ones."""
+    """The field that ``recipe`` fits to all views except held-out ones."""
 
     phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "field"
@@ -56,10 +56,10 @@ class FieldStage(Stage[FittedField]):
         return f"field of {self.views.object}"
 
     def usable(self, results: Results) -> RadianceField:
-        """Return the field, for what trains on its renders.
+        """Return the field for rendering training images.
 
         Raises:
-            ValueError: a field of photographs that does not show its object, unless ``objects.poor`` says otherwise.
+            ValueError: a field fitted to photographs does not show its object, unless ``objects.poor`` allows that.
         """
         fitted = results(self)
         if fitted.poor and self.views.objects.refuses_poor:

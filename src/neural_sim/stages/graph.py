@@ -1,4 +1,4 @@
-"""The stages of one experiment and how they hang together."""
+"""The graph of an experiment's stages."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from neural_sim.stages.symmetry import SymmetryStage
 
 @dataclass(frozen=True)
 class Graph(Images):
-    """Stages by what they give: images, and the detectors, psi and scores that come of them.
+    """The stages of an experiment: images, and the detectors, psi and scores made from them.
 
     Args:
-        experiment: whose stages these are.
-        on_record: is called with every iteration of the psi loop as it ends.
+        experiment: the experiment.
+        on_record: called with the record of each iteration of the psi loop when it ends.
 
     Raises:
-        ValueError: objects that a setting names and the source lacks, or photographs that are to train and a target
-            without any for it.
+        ValueError: a setting names an object that the source lacks, or asks to train on photographs of a target that
+            has none for training.
     """
 
     on_record: Callable[[IterationRecord], object] | None = None
@@ -49,10 +49,10 @@ class Graph(Images):
 
     @cached_property
     def warm_start(self) -> DetectorStage:
-        """The detector whose backbone the psi loop trains on, and that some methods begin with.
+        """The detector whose backbone the psi loop trains on, and that some methods start from.
 
-        Of the initial distribution, with equal epochs, and unless scored detectors are fine-tuned, it is also scored as
-        ``ns``.
+        If it is trained on the initial distribution, for as many epochs as scored detectors, and these are not
+        fine-tuned, it is also the detector scored as ``ns``.
         """
         x = self.experiment
         if x.training.warm_start == "initial":
@@ -61,16 +61,16 @@ class Graph(Images):
 
     @cached_property
     def of_initial(self) -> DetectorStage:
-        """The detector of the initial distribution, trained as the warm start is."""
+        """The detector of the initial distribution, trained like the warm start."""
         epochs = self.experiment.training.warm_epochs
         return self._detector(self.psi("initial"), epochs, "warm_start", "the initial distribution")
 
     @cached_property
     def _training(self) -> Training:
-        """The training as detectors' keys have it: without what does not change them.
+        """The training settings in the form that enters the keys of detectors, without irrelevant differences.
 
-        Psi says what a detector is trained on, whatever the warm start's is; and where the target knows how many
-        photographs it has, their number counts, however it was asked for.
+        The distribution of the warm start is left out, because psi says what a detector is trained on. If the target
+        knows how many photographs it has, a fraction of them is replaced by their number.
         """
         x, real = self.experiment, self.experiment.training.real
         if real.used and (count := x.imaging.target.training_count(x.run.seed)) is not None:
@@ -80,10 +80,10 @@ class Graph(Images):
     def _detector(
         self, psi: Psi, epochs: int, phase: str, called: str, photographs: bool = True
     ) -> DetectorStage:
-        """Return a detector trained on a distribution, and on photographs where the training combines both."""
+        """Return a detector trained on a distribution, and on photographs if the training combines both."""
         x, training = self.experiment, self._training
         combined = photographs and training.real.combined
-        if not combined:  # so that its key is that of a run without photographs
+        if not combined:  # so that its key is the same as in a run without photographs
             training = replace(training, real=Real())
         probabilities = x.imaging.distribution.digest_of(psi)
         return DetectorStage(
@@ -92,7 +92,7 @@ class Graph(Images):
         )  # fmt: skip
 
     def _on_photographs(self, start: DetectorStage | None) -> PhotographsStage:
-        """Return a detector trained on photographs, in as many steps as one on images, or fine-tuned on them."""
+        """Return a detector trained on photographs alone, in as many steps as on images, or fine-tuned on them."""
         x, training, real = self.experiment, self._training, self._training.real
         steps = -(-training.images_per_object * len(self.names) // training.batch_size)
         epochs = training.cold_epochs
@@ -124,13 +124,13 @@ class Graph(Images):
 
     @cached_property
     def pool(self) -> PoolStage:
-        """Renders of all bins, which the loop composes and the target's boxes are read by."""
+        """Renders of all bins, from which the loop composes images and the reader of the target's boxes is trained."""
         x = self.experiment
         return PoolStage(self.scene, self._reading.per_bin, x.loop.outer.quality, x.run.seed)
 
     @cached_property
     def shown(self) -> ShownStage:
-        """What the target's boxes show, read as the method says where it reads them."""
+        """The psi estimated from the target's boxes, with the settings of the method if it estimates."""
         x, settings = self.experiment, self._reading
         return ShownStage(
             self.pool, self.targets, self._symmetries, x.imaging.distribution, settings, self.psi("initial"),
@@ -139,14 +139,14 @@ class Graph(Images):
 
     @property
     def _symmetries(self) -> tuple[SymmetryStage, ...]:
-        """The bins of every object and angle that look the same."""
+        """Groups of bins that look the same, for every object and angle."""
         binned = self.experiment.imaging.distribution.binned
         angles = [factor.name for factor in binned if factor.coordinate in ("phi", "rho")]
         return tuple(self.symmetry(name, angle) for name in self.names for angle in angles)
 
     @property
     def read_warm_start(self) -> tuple[DetectorStage, ...]:
-        """The warm start, unless the method does without."""
+        """The warm start, unless the method does not need it."""
         return () if isinstance(self.experiment.loop.method, LabelShift) else (self.warm_start,)
 
     @cached_property
@@ -163,7 +163,7 @@ class Graph(Images):
         )  # fmt: skip
 
     def synthetic(self, psi: Psi, called: str) -> DetectorStage:
-        """Return the detector of a distribution, trained without photographs."""
+        """Return the detector trained on images of a distribution, without photographs."""
         return self._detector(
             psi, self.experiment.training.cold_epochs, "evaluate", called, photographs=False
         )
@@ -171,7 +171,7 @@ class Graph(Images):
     def trained_on(self, psi: Psi, called: str) -> TrainedStage:
         """Return the detector that is scored for a distribution.
 
-        Photographs train it, too, or fine-tune it, as ``training.real`` says.
+        It is also trained or fine-tuned on photographs if ``training.real`` says so.
         """
         real = self.experiment.training.real
         if real.used and real.mode == "pretrain":
@@ -183,11 +183,12 @@ class Graph(Images):
         return ScoresStage(self.trained_on(psi, called), self.targets, part)
 
     def compared(self, learned: LearnedPsi) -> dict[str, ScoresStage]:
-        """Return the scores that a run reports by their names.
+        """Return the scores that a run reports, by name.
 
-        They are of the initial distribution (``ns``), the ``learned`` one, and the target's own (``matched``) where
-        that is known; where photographs train too, also of the learned one without them (``synthetic_only``), of
-        photographs alone (``real_only``), and of the fields' own views (``views_only``).
+        There are detectors of the initial distribution (``ns``), the ``learned`` one and, if known, the target's own
+        (``matched``). If photographs are used in training, there are also detectors trained on the learned distribution
+        without them (``synthetic_only``), on photographs alone (``real_only``) and on the views that fields are fitted
+        to (``views_only``).
         """
         psis = {"ns": self.psi("initial"), "learned": learned.last, "matched": self.target_psi}
         rows = {called: self.scores(psi, called) for called, psi in psis.items() if psi is not None}
@@ -198,7 +199,7 @@ class Graph(Images):
         return rows
 
     def on_the_way(self, learned: LearnedPsi) -> dict[int, Psi]:
-        """Return psi by iterations done: at the start, at the parts of all that ``score_at`` names, at the end."""
+        """Return psi by number of iterations: at the start, at the fractions in ``score_at``, and at the end."""
         last = len(learned.trajectory) - 1
         asked = {0, last, *(math.floor(part * last + 0.5) for part in self.experiment.run.score_at)}
         return {iteration: learned.trajectory[iteration] for iteration in sorted(asked)}
@@ -208,7 +209,7 @@ class Graph(Images):
         return self.scores(learned.last, "learned", "val")
 
     def evaluated(self, learned: LearnedPsi) -> list[ScoresStage]:
-        """Return all scores that a run makes."""
+        """Return all scores that a run computes."""
         on_the_way = [
             self.scores(psi, f"psi after {i} iterations") for i, psi in self.on_the_way(learned).items()
         ]

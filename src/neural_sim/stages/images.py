@@ -1,4 +1,4 @@
-"""The stages of an experiment's images: views, fields, the scene, target sets; and the psi that they are drawn from."""
+"""Stages that make the images of an experiment: views, fields, the scene and target sets; and the configured psi."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from neural_sim.types import PinholeCamera
 
 Psi = Float[Tensor, "objects K"]
 THUMBNAIL = 96
-"""Pixels along each side of a bin's picture."""
+"""Side in pixels of the picture of a bin."""
 
 
 @dataclass(frozen=True)
 class Images:
-    """Stages of images by what they give.
+    """The stages of an experiment that make images, and the configured distributions.
 
     Raises:
-        ValueError: objects that a setting names and the source lacks.
+        ValueError: a setting names an object that the source lacks.
     """
 
     experiment: Experiment
@@ -61,12 +61,12 @@ class Images:
 
     @property
     def camera(self) -> PinholeCamera:
-        """The camera of synthesised and of rendered target images."""
+        """The camera of synthesised images and of rendered target images."""
         return self.experiment.imaging.camera
 
     @cached_property
     def radii(self) -> tuple[float, ...] | None:
-        """The objects' radii in metres; None where distances are in radii, and objects need not be read."""
+        """The radii of the objects in metres; None if distances are in radii, so that objects need not be read."""
         distribution = self.experiment.imaging.distribution
         return None if distribution.distance_unit == "radii" else distribution.radii(self.objects.radii)
 
@@ -84,7 +84,7 @@ class Images:
 
     @cached_property
     def qualities(self) -> tuple[QualityStage, ...]:
-        """How well every object's field shows it."""
+        """How well each object's field shows the object."""
         imaging, radii = self.experiment.imaging, self.radii or (None,) * len(self.fields)
         camera, distribution = imaging.views.camera(THUMBNAIL), imaging.distribution
         return tuple(
@@ -94,7 +94,7 @@ class Images:
 
     @cached_property
     def scene(self) -> SceneStage:
-        """What training images are synthesised from."""
+        """The scene that training images are synthesised from."""
         imaging = self.experiment.imaging
         return SceneStage(
             self.subjects(self.fields, imaging.renderer), self.camera, imaging.synthesis,
@@ -104,7 +104,7 @@ class Images:
     def subjects(
         self, fields: tuple[FieldStage, ...], renderer: NerfRenderer
     ) -> tuple[FieldSubjectStage, ...]:
-        """Return the objects of the scene by given fields."""
+        """Return the subjects of the scene for given fields."""
         radii = self.radii or (None,) * len(fields)
         return tuple(
             FieldSubjectStage(field, renderer, radius) for field, radius in zip(fields, radii, strict=True)
@@ -122,11 +122,11 @@ class Images:
 
     @property
     def renders_target(self) -> bool:
-        """Whether the target's images are rendered; otherwise they are photographs."""
+        """Whether target images are rendered; otherwise they are photographs."""
         return self.experiment.imaging.target.renders
 
     def symmetry(self, name: str, angle: str) -> SymmetryStage:
-        """Return the groups of an object's bins of an angle that look the same."""
+        """Return the groups of bins of an angle in which an object looks the same."""
         imaging = self.experiment.imaging
         camera = imaging.views.camera(48)
         fields = self._in_place_of_meshes(self.fields[self.names.index(name)])
@@ -143,24 +143,24 @@ class Images:
 
     @property
     def uniform(self) -> Psi:
-        """The psi of equal probabilities of all bins that are not left out."""
+        """The psi with equal probabilities for all bins that are not left out."""
         return self.experiment.imaging.distribution.uniform_of(self.names)
 
     @property
     def target_psi(self) -> Psi | None:
         """The target's psi, None if unknown.
 
-        Photographs have none unless a configured distribution says what they show: uniform, the default, would not be
-        meant as a target.
+        For photographs it is known only if a target distribution is configured explicitly; the default, uniform, says
+        nothing about them.
         """
         known = self.renders_target or self.experiment.imaging.distribution.states_target
         return self.psi("target") if known else None
 
     def stated_psi(self, which: Literal["initial", "target"], key: str) -> Psi:
-        """Return the initial psi or the target's, which ``key`` of the configuration asks for.
+        """Return the initial psi or the target's, as the configuration key ``key`` asks for.
 
         Raises:
-            ValueError: the target's is unknown.
+            ValueError: the target's psi is unknown.
         """
         psi = self.psi("initial") if which == "initial" else self.target_psi
         if psi is None:

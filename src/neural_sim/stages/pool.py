@@ -1,4 +1,4 @@
-"""Stage ``pool``: renders of all bins, for everything that reads or composes them in one run."""
+"""Stage ``pool``: renders of all bins, shared by everything in a run that reads or composes them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from neural_sim.stages.stage import Results, Stage
 
 @dataclass(frozen=True)
 class PoolStage(Stage[RenderedPool]):
-    """``per_bin`` renders of every bin of ``scene``'s objects, at ``quality``, by the psi loop's random numbers.
+    """``per_bin`` renders of every bin of every object in ``scene``, drawn with the random numbers of the psi loop.
 
-    It stays in memory: a run whose estimate and whose loop want the same pool renders it once.
+    The pool stays in memory, so that label shift and the psi loop share it if they need the same one.
     """
 
     phase: ClassVar[str] = "psi"

@@ -1,4 +1,4 @@
-"""Stage ``psi``: the distribution that a method learns, and the iterations on the way to it."""
+"""Stage ``psi``: the distribution that a method learns, with the iterations that led to it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _STATE = (
     Average, Certificate, FactorEstimate, ImplicitQuality, IterationRecord, Stay, TakenBack, UnrolledQuality,
     UpdateState, Verdict,
 )  # fmt: skip
-"""What a loop's state holds, see ``OuterLoop.state``."""
+"""Dataclasses in the state of a loop, see ``OuterLoop.state``."""
 Method = Fixed | LabelShift | HypergradientLoop | Response | RewardMethod
 
 
@@ -58,16 +58,16 @@ class HypergradientParts:
 
 @dataclass(frozen=True)
 class PsiStage(Stage[LearnedPsi]):
-    """The psi loop of ``method`` from the warm start's distribution.
+    """The psi that ``method`` learns from the initial distribution.
 
-    ``parts`` are those of a method that follows the hypergradient, ``pool`` has the renders of a loop that
-    reuses them, ``shown`` is what the method reads off the target's
-    boxes; None for others. ``symmetries`` are of the bins that ``outer.first_step`` reads off them. ``on_record`` is
-    called with every iteration's record as it ends.
+    Inputs that the method does not use are None: ``parts`` for methods that follow the hypergradient, ``pool`` with the
+    renders that a loop reuses, ``shown`` with the estimate from the target's boxes. ``symmetries`` are the groups of
+    bins that ``outer.first_step`` cannot tell apart in the boxes. ``on_record`` is called with the record of each
+    iteration when it ends.
 
     Raises:
-        ValueError: ``outer.loop_layers`` of a backbone that has no such stages, or a solver that does not take the
-            detector's parameters; here, before fields are trained.
+        ValueError: the backbone has fewer stages than ``outer.loop_layers``, or the detector has too many parameters
+            for the solver; raised here, before fields are trained.
     """
 
     phase: ClassVar[str] = "psi"
@@ -114,7 +114,7 @@ class PsiStage(Stage[LearnedPsi]):
 
     @property
     def draws(self) -> Draws:
-        """How the method wants its images drawn: as its estimator does, exactly where it has none."""
+        """How images are drawn: as the estimator of the method needs them, or exactly if it has none."""
         return HARD if self.parts is None else self.parts.estimator.draws
 
     @override
@@ -132,10 +132,10 @@ class PsiStage(Stage[LearnedPsi]):
         return replace(learned, before=warm_start.cost)
 
     def loop(self, results: Results) -> OuterLoop:
-        """Return the method's loop, not yet run, on renders of ``outer.quality``.
+        """Return the loop of the method, not yet run, on renders of ``outer.quality``.
 
         Raises:
-            ValueError: a method without one.
+            ValueError: the method has no loop.
         """
         method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
         if self.outer.quality is not None:
@@ -158,7 +158,7 @@ class PsiStage(Stage[LearnedPsi]):
         return RewardLoop(inner, self.initial, method, generator)
 
     def _first_step(self, results: Results, whole: bool) -> FirstStep | None:
-        """Return what proposes the loop's first step; None: its first derivative."""
+        """Return the proposal for the first step of the loop; None: it follows the first derivative."""
         settings = self.outer.first_step
         if isinstance(settings, Derivative):
             return None

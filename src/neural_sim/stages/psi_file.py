@@ -1,4 +1,4 @@
-"""psi from what a run or an export left."""
+"""Read psi from the files of a run or an export."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from neural_sim.parameter.product import SceneDistribution
 def psi_of_file(
     path: Path, distribution: SceneDistribution, names: Sequence[str], key: str = "export.psi"
 ) -> Float[Tensor, "objects K"]:
-    """Read the psi of a run's folder or its ``results.json`` (the learned one), or of an export's ``psi.json``.
+    """Read psi from a run's folder or its ``results.json`` (the learned psi), or from an export's ``psi.json``.
 
-    ``key`` is the setting that named the file.
+    ``key`` is the setting that names the file.
 
     Raises:
-        ValueError: no such file, none of these, or one without an object or a factor, or with other bins.
+        ValueError: the file does not exist, is of another kind, lacks an object or a factor, or has other bins.
     """
     file = path / "results.json" if path.is_dir() else path
     if not file.is_file():
@@ -56,7 +56,7 @@ def psi_of_file(
 
 
 def _numbers(stored: Any, name: str, factor: str) -> list[float]:
-    """Of ``results.json``, where a factor has an initial and a target distribution too, or of ``psi.json``."""
+    """Return the numbers of a factor from ``psi.json``, or the learned ones of the three in ``results.json``."""
     if name not in stored:
         raise KeyError(name)
     if factor not in stored[name]:

@@ -1,4 +1,4 @@
-"""Stage ``quality``: what says whether a field shows its object, for a page and for the refusal to train on it."""
+"""Stage ``quality``: scores and pictures that show whether a field shows its object."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from neural_sim.synthesis.thumbnails import bin_thumbnails
 from neural_sim.types import PinholeCamera
 
 SHOWN = 4
-"""Held-out views on a page."""
+"""Number of held-out views on a page."""
 
 
 @dataclass(frozen=True)
 class QualityStage(Stage[Quality]):
-    """Scores and pictures of one object's field.
+    """Scores and pictures of the field of one object.
 
-    The key covers ``drawn``, what draws depend on, not the distribution; ``camera`` is that of the bins' pictures.
+    The key covers ``drawn``, the settings that draws depend on, not the distribution; ``camera`` takes the pictures of
+    bins.
     """
 
     phase: ClassVar[str] = "field"

@@ -1,4 +1,4 @@
-"""Meshes that are reconstructed from objects' views, and subjects of scenes that show them."""
+"""Stages of meshes reconstructed from the views of objects, and of scene subjects that show them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from neural_sim.synthesis.subjects import MeshSubject
 
 @dataclass(frozen=True)
 class ReconstructionStage(Stage[trimesh.Trimesh]):
-    """The mesh of all views but the held-out ones, see ``reconstruct``."""
+    """The mesh reconstructed from all views except held-out ones, see ``reconstruct``."""
 
     phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "reconstruction"
@@ -52,7 +52,7 @@ class ReconstructionStage(Stage[trimesh.Trimesh]):
 
 @dataclass(frozen=True)
 class ReconstructionSubjectStage(SubjectStage[MeshSubject]):
-    """An object by its reconstructed mesh; ``radius`` is in metres, None where distances are in radii."""
+    """An object shown by its reconstructed mesh; ``radius`` is in metres, None if distances are in radii."""
 
     reconstruction: ReconstructionStage
     radius: float | None

@@ -1,4 +1,4 @@
-"""Scenes and their subjects, put together in memory from fields, meshes or views; and images of another program."""
+"""Scenes and their subjects, assembled in memory from fields, meshes or views; and images made by other programs."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class SubjectStage(Stage[SubjectT]):
 
     @property
     def title(self) -> str:
-        """The result in words."""
+        """Description of the result."""
         return f"{self.object} in a scene"
 
 
 @dataclass(frozen=True)
 class FieldSubjectStage(SubjectStage[FieldSubject]):
-    """An object by its field; ``radius`` is in metres, None where distances are in radii."""
+    """An object shown by its field; ``radius`` is in metres, None if distances are in radii."""
 
     field: FieldStage
     renderer: NerfRenderer
@@ -65,7 +65,7 @@ class FieldSubjectStage(SubjectStage[FieldSubject]):
 
 @dataclass(frozen=True)
 class MeshSubjectStage(SubjectStage[RenderedSubject]):
-    """The object ``item`` by its mesh, whose digest is ``content``, under one fixed light."""
+    """The object ``item`` shown by its mesh, whose digest is ``content``, under one fixed light."""
 
     item: str
     content: str
@@ -84,9 +84,9 @@ class MeshSubjectStage(SubjectStage[RenderedSubject]):
 
 @dataclass(frozen=True)
 class PictureSubjectStage(SubjectStage[PictureSubject]):
-    """An object by the views that its field is fitted to (the paper's "images to train NeRF", Sec. 4.4 and Table 2).
+    """An object shown by the views that its field is fitted to (the paper's "images to train NeRF", Sec. 4.4, Table 2).
 
-    ``camera`` is that of the scene's images; ``radius`` is the object's in the unit of the scene's distances.
+    ``camera`` takes the images of the scene; ``radius`` is in the unit of the scene's distances.
     """
 
     views: ViewsStage
@@ -106,17 +106,17 @@ class PictureSubjectStage(SubjectStage[PictureSubject]):
 
 
 class TrainingImages(Protocol):
-    """What gives a detector its training images: a ``Scene``, or ``LoadedImages``."""
+    """A source of training images: a ``Scene``, or ``LoadedImages``."""
 
     def training_set(
         self, psi: Float[Tensor, "objects K"], count: int, generator: torch.Generator
     ) -> RenderedImages:
-        """Return labelled images, ``count`` of every object where they are drawn from p_psi."""
+        """Return labelled images, ``count`` per object if they are drawn from p_psi."""
         ...
 
 
 class TrainingImagesStage(Stage[Any]):
-    """What gives a detector its training images (``TrainingImages``)."""
+    """A stage whose result is a source of training images (``TrainingImages``)."""
 
     phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "scene"
@@ -134,8 +134,8 @@ class TrainingImagesStage(Stage[Any]):
 class SceneStage(TrainingImagesStage):
     """The scene of ``subjects``.
 
-    The key covers ``drawn``, which is what draws of given probabilities depend on, not ``distribution``: methods that
-    relax draws differently use the same results of hard draws.
+    The key covers ``drawn``, the settings that draws from given probabilities depend on, instead of ``distribution``,
+    so that methods that relax draws differently share results of hard draws.
     """
 
     subjects: tuple[SubjectStage[Any], ...]
@@ -155,7 +155,7 @@ class SceneStage(TrainingImagesStage):
         return "scene of all objects"
 
     def showing(self, subjects: tuple[SubjectStage[Any], ...]) -> SceneStage:
-        """Return the scene with other subjects at the same draws, backgrounds and places."""
+        """Return the scene with other subjects, but the same draws, backgrounds and positions."""
         return replace(self, subjects=subjects)
 
     @override
@@ -166,7 +166,7 @@ class SceneStage(TrainingImagesStage):
 
 @dataclass(frozen=True)
 class LoadedImages:
-    """Images that another program made, which psi has no part in."""
+    """Images made by another program, independently of psi."""
 
     images: LabelledImages
 
@@ -179,7 +179,7 @@ class LoadedImages:
 
 @dataclass(frozen=True)
 class LoadedImagesStage(TrainingImagesStage):
-    """All images of a COCO file, resized to the camera's size."""
+    """All images of a COCO file, resized to the image size of the camera."""
 
     source: CocoTarget
     class_names: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Stage ``shown``: what the target's boxes show, before any detector is trained."""
+"""Stage ``shown``: the psi estimated from the target's boxes, before any detector is trained."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from neural_sim.stages.target_sets import TargetSetsStage
 
 @dataclass(frozen=True)
 class ShownStage(Stage[Estimate]):
-    """The estimate by label shift, from the target's validation images.
+    """The label-shift estimate from the target's validation images.
 
-    ``symmetries`` are the bins of every object and angle that look the same; ``psi`` is where it stands; ``whole``:
-    images are read as a whole, since they have no boxes.
+    ``symmetries`` are the groups of bins that look the same; ``psi`` is the current psi, which the estimate is tested
+    against; with ``whole``, images are read as a whole, since they have no boxes.
     """
 
     phase: ClassVar[str] = "psi"
@@ -67,7 +67,7 @@ class ShownStage(Stage[Estimate]):
 
 
 def groups_of(symmetries: Sequence[SymmetryStage], results: Results) -> Groups:
-    """Return the bins that look the same, by object and angle."""
+    """Return the groups of bins that look the same, by object and angle."""
     groups: dict[str, dict[str, list[list[int]]]] = {}
     for stage in symmetries:
         groups.setdefault(stage.object, {})[stage.angle] = results(stage)

@@ -1,4 +1,4 @@
-"""A stage: its inputs, the key of its result, how that is computed and stored. And the evaluation of stages."""
+"""Stages, which define their inputs, their key and how their result is made and stored; and their evaluation."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ UNKEYED = {"key": False}
 class Stage(ABC, Generic[T]):
     """A frozen dataclass. Its fields that are stages, alone or in a tuple, are its inputs; the rest are settings.
 
-    The key of the result covers the settings, the keys of the inputs, and the version of all code that the stage's
-    module and its settings' modules import. Fields whose metadata is ``UNKEYED`` are left out: they affect how fast a
-    result is computed, or follow from other fields.
+    The key of the result covers the settings, the keys of the inputs, and the version of all code imported by the
+    modules of the stage and its settings. Fields whose metadata is ``UNKEYED`` are left out: they only affect how fast
+    a result is computed, or follow from other fields.
     """
 
     phase: str
@@ -39,28 +39,28 @@ class Stage(ABC, Generic[T]):
     keep: ClassVar[bool] = True
     """Whether a run keeps the result in memory once it has read it."""
     stored: ClassVar[bool] = True
-    """Whether the result goes to the store; what is quickly put together from inputs stays in memory."""
+    """Whether the result goes to the store; a result that is quickly assembled from its inputs stays in memory."""
 
     @property
     def early(self) -> bool:
-        """Whether the result is made before all others, because what the user gave for it may be unusable."""
+        """Whether the result is made before all others, because the user's data for it may be unusable."""
         return False
 
     def check(self) -> None:
-        """Refuse now what ``make`` would refuse, as far as that shows without results of other stages.
+        """Raise the errors of ``make`` that can be detected without the results of other stages.
 
         Raises:
-            ValueError: as ``make``.
+            ValueError: as ``make`` does.
         """
 
     @property
     @abstractmethod
     def title(self) -> str:
-        """Return the result in words, for messages."""
+        """Return a description of the result, for messages."""
 
     @abstractmethod
     def make(self, results: Results) -> T:
-        """Return the result, made from those of the inputs."""
+        """Return the result, made from the results of the inputs."""
 
     def pack(self, value: T) -> Any:
         """Return the result as tensors, numbers, strings, and lists and dictionaries of these."""
@@ -81,7 +81,7 @@ class Stage(ABC, Generic[T]):
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """All that the result depends on."""
+        """Everything that the result depends on."""
         settings: dict[str, Any] = {}
         for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
             if field.metadata.get("key", True):
@@ -104,22 +104,22 @@ class Stage(ABC, Generic[T]):
 
     @cached_property
     def key(self) -> str:
-        """Of the result in the store."""
+        """The key of the result in the store."""
         return digest(self.description)
 
     @property
     def entry(self) -> str:
-        """Kind and key: the result's place in every store."""
+        """Kind and key, which locate the result in every store."""
         return f"{self.kind} {self.key}"
 
 
 class Results:
-    """Evaluates stages: a result is read once, from memory or the store, or computed from its inputs' results.
+    """Evaluates stages: takes a result from memory, reads it from the store, or computes it from those of its inputs.
 
     Args:
-        store: where results are kept.
-        account: is charged for every result, and told of those that the store had.
-        resume: whether unfinished work of earlier runs is taken up; it begins anew otherwise.
+        store: store of results.
+        account: account that is charged for every result and notes those found in the store.
+        resume: whether to resume unfinished work of earlier runs instead of starting again.
     """
 
     def __init__(self, store: Store, account: Account | None = None, resume: bool = True) -> None:
@@ -149,16 +149,16 @@ class Results:
         return stage.unpack(entry.value)
 
     def seen(self, entry: str) -> None:
-        """Note that this run has made a result elsewhere, so that it is not said to have been found in the store."""
+        """Note that this run made a result in another process, so that it is not reported as found in the store."""
         self._seen.add(entry)
 
     def checkpoint(self, stage: Stage[Any], classes: Sequence[type] = (), every: float = 0.0) -> Checkpoint:
-        """Return where the work of a stage that is being made stands, see ``Checkpoint`` and ``Store``.
+        """Return the checkpoint of a stage that is being made, see ``Checkpoint`` and ``Store``.
 
         Args:
             stage: the stage.
-            classes: the dataclasses that its state holds.
-            every: seconds between two writings, at least.
+            classes: dataclasses that occur in its state.
+            every: smallest number of seconds between two writes.
         """
         store, kind, key = self.store, stage.kind, stage.key
         if not self.resume:
@@ -168,9 +168,9 @@ class Results:
         )
 
     def free_first(self, stages: Iterable[Stage[T]]) -> Iterator[Stage[T]]:
-        """Yield the stages, those whose results another run is making now last: it may have made them by then.
+        """Yield the stages, leaving those that another run is making now for last, when they may be finished.
 
-        So runs that begin together share the work, instead of each waiting for the same result first.
+        Runs that start together thus share the work instead of all waiting for the same result.
         """
         later: list[Stage[T]] = []
         for stage in stages:
@@ -183,7 +183,7 @@ class Results:
         yield from later
 
     def missing(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
-        """Return the stages whose results would be computed in order to evaluate these, inputs first."""
+        """Return all stages that would have to be computed to evaluate these, inputs first."""
         found: list[Stage[Any]] = []
         seen = set(self._kept)
 
@@ -203,13 +203,13 @@ class Results:
         return found
 
     def check(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
-        """Refuse now what evaluating the stages would refuse, perhaps after minutes of work on other results.
+        """Raise now the errors that evaluating the stages might otherwise raise after minutes of other work.
 
         Returns:
-            The stages that would be computed, see ``missing``; those that are to be made early are made already.
+            The stages that would be computed, see ``missing``. Early stages have been made already.
 
         Raises:
-            ValueError: as evaluating them.
+            ValueError: as evaluating the stages does.
         """
         missing = self.missing(stages)
         for stage in missing:

@@ -1,12 +1,12 @@
 """A content-addressed store of stage results: equal inputs are computed once.
 
-Entries are written to a temporary name and moved into place, so that a killed run leaves none half written. Computation
-is locked between processes: concurrent runs wait for a result that one of them is computing. A lock ends with its
-process.
+Entries are written under a temporary name and moved into place, so that a killed run leaves no half-written entry.
+A lock keeps two processes from computing the same result: concurrent runs wait for the one that has it, and the lock
+ends with its process.
 
-An entry is a line of text, which has the SHA-256 and the size of all that follows, and then what ``torch.save`` wrote.
-Both are checked whenever it is read: one that a disk or a copy has changed is set aside and made again. Checkpoints of
-unfinished work lie beside the entries, in the same form, until the result stands.
+An entry is a line of text with the SHA-256 and the size of the rest of the file, followed by the output of
+``torch.save``. Both are checked on every read; an entry that a disk or a copy has damaged is set aside and made again.
+Checkpoints of unfinished work are kept next to the entries, in the same format, until the result is finished.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from neural_sim.checkpoint import State
 _log = logging.getLogger(__name__)
 
 DAMAGED = ".damaged"
-"""Suffix, in the place of ``.pt``, of an entry that was not what had been written."""
+"""Suffix, instead of ``.pt``, of a damaged entry."""
 CHECKPOINT = ".checkpoint"
-"""Suffix, in the place of ``.pt``, of where the work on a result stands."""
+"""Suffix, instead of ``.pt``, of a checkpoint of unfinished work."""
 _SUFFIXES = (".pt", ".json", CHECKPOINT)
 _HEADER = "neural-sim entry 1, sha256 {sha256:64}, bytes {size:20d}\n"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A stored result. ``seconds`` is the time of its computation, also where it is ``reused`` from the store."""
+    """A stored result. ``seconds`` is the time of its computation, even if it was ``reused`` from the store."""
 
     value: Any
     seconds: float
@@ -51,14 +51,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Audit:
-    """What lies in a store.
+    """The contents of a store.
 
     Attributes:
-        sound: entries whose content is what was written.
-        damaged: the others.
-        left: files that are no entries: half written by killed runs, or set aside as damaged.
-        checkpoints: of work that was not finished.
-        bytes: size of the sound entries.
+        sound: entries whose content matches their checksum.
+        damaged: entries whose content does not.
+        left: other files: half written by killed runs, or set aside as damaged.
+        checkpoints: checkpoints of unfinished work.
+        bytes: total size of the sound entries.
     """
 
     sound: list[Path]
@@ -77,15 +77,15 @@ class Store:
     def fetch(self, kind: str, key: str, description: Mapping[str, Any], make: Callable[[], Any]) -> Entry:
         """Return the result ``key``, from the store or from ``make``.
 
-        ``make`` returns tensors, numbers, strings and lists and dicts of these: all that is read back is read
-        with ``weights_only``, so that a shared store cannot run code. An entry that cannot be read, or that is not
-        what was written, is set aside and made again, with a warning.
+        ``make`` returns tensors, numbers, strings, and lists and dicts of these: entries are read with
+        ``weights_only``, so that a shared store cannot run code. A damaged or unreadable entry is set aside and made
+        again, with a warning.
 
         Raises:
-            ValueError: a store that cannot be written to, with its path.
+            ValueError: the store cannot be written to; the message has its path.
         """
         path = self._path(kind, key)
-        with suppress(_Damage):  # looked at again under the lock
+        with suppress(_Damage):  # handled below, under the lock
             if (entry := _read(path)) is not None:
                 return entry
         with _writing(path):
@@ -109,10 +109,10 @@ class Store:
         return Entry(value, seconds, reused=False)
 
     def state(self, kind: str, key: str, classes: Sequence[type] = ()) -> Any:
-        """Return where unfinished work on the result ``key`` stands, None where there is none.
+        """Return the state of unfinished work on the result ``key``, None if there is none.
 
-        For the process that makes the result, and alone has its lock. ``classes`` are the dataclasses that a state may
-        hold. A damaged one is set aside, with a warning: the work begins anew.
+        Only for the process that makes the result and holds its lock. ``classes`` are the dataclasses that may occur in
+        a state. A damaged checkpoint is set aside, with a warning, and the work starts again.
         """
         path = self._path(kind, key).with_suffix(CHECKPOINT)
         try:
@@ -122,7 +122,7 @@ class Store:
             return None
 
     def keep(self, kind: str, key: str, state: State) -> None:
-        """Write where the work on the result ``key`` stands; where that fails the work goes on, with a warning."""
+        """Write a checkpoint of the result ``key``; if that fails, the work goes on with a warning."""
         path = self._path(kind, key).with_suffix(CHECKPOINT)
         try:
             with _writing(path):
@@ -138,7 +138,7 @@ class Store:
             path.unlink(missing_ok=True)
 
     def has(self, kind: str, key: str) -> bool:
-        """Whether there is a file of the result; it is not read."""
+        """Whether the result has a file, without reading it."""
         return self._path(kind, key).is_file()
 
     def busy(self, kind: str, key: str) -> bool:
@@ -150,7 +150,7 @@ class Store:
             return not ours
 
     def audit(self) -> Audit:
-        """Check the content of every entry against its sum, and list what is no entry; nothing is changed."""
+        """Check every entry against its checksum, and list all other files; nothing is changed."""
         sound, damaged, size = [], [], 0
         for path in sorted(self.root.glob("*/[!.]*.pt")):
             try:
@@ -170,14 +170,14 @@ class Store:
 
 
 class _Damage(Exception):
-    """A file that is not the entry that was written; its message says why."""
+    """A file is damaged; the message says how."""
 
 
 @contextmanager
 def locked(path: Path, wait: bool = True) -> Iterator[bool]:
-    """Alone with an entry. The operating system frees the lock when its holder ends, however that ends.
+    """Lock an entry. The operating system frees the lock when its process ends, in whatever way.
 
-    Yields whether this process has it, which without ``wait`` it may not.
+    Yields whether this process got the lock, which is certain only with ``wait``.
     """
     lock = _lock(path)
     with _writing(path):
@@ -198,7 +198,7 @@ def _lock(path: Path) -> FileLock:
 
 
 def _read(path: Path) -> Entry | None:
-    """Return an entry, None where there is none. Raises ``_Damage``."""
+    """Return an entry, None if there is none. Raises ``_Damage``."""
     stored = _content(path)
     if stored is None:
         return None
@@ -208,14 +208,16 @@ def _read(path: Path) -> Entry | None:
 
 
 def _content(path: Path, classes: Sequence[type] = ()) -> Any:
-    """Return what a file holds, None where there is none. Raises ``_Damage``."""
+    """Return the content of a file, None if it does not exist. Raises ``_Damage``."""
     try:
         with path.open("rb") as file, torch.serialization.safe_globals(list(classes)):
             file.seek(_checked_header(file))
             return torch.load(file, weights_only=True)
     except FileNotFoundError:
         return None
-    except pickle.UnpicklingError as error:  # its message advises to read with weights_only=False
+    except (
+        pickle.UnpicklingError
+    ) as error:  # its own message advises weights_only=False, which would run code
         raise _Damage("it holds other than tensors, numbers, strings, lists and mappings") from error
     except (OSError, RuntimeError, EOFError, ValueError) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
@@ -223,7 +225,7 @@ def _content(path: Path, classes: Sequence[type] = ()) -> Any:
 
 
 def _checked_header(file: BinaryIO) -> int:
-    """Return the length of an entry's first line, of which the rest is found true. Raises ``_Damage``."""
+    """Check a file against its first line and return the length of that line. Raises ``_Damage``."""
     header = file.readline(len(_header("", 0)))
     if not header.startswith(_HEADER[:16].encode()):
         raise _Damage("it has no sum of its content, as entries of older versions")
@@ -237,7 +239,7 @@ def _save(content: Mapping[str, Any], file: BinaryIO) -> None:
     file.seek(begin)
     try:
         torch.save(content, file)
-    except RuntimeError as error:  # of torch, when it closes an archive that the system did not let it write
+    except RuntimeError as error:  # raised by torch on closing an archive that could not be written
         if isinstance(error.__context__, OSError):
             raise error.__context__ from error
         raise
@@ -253,7 +255,7 @@ def _header(sha256: str, size: int) -> bytes:
 
 
 def _sha256(file: BinaryIO) -> str:
-    """Hash what follows, to the end of the file."""
+    """Hash the rest of the file."""
     return hashlib.file_digest(file, "sha256").hexdigest()  # pyright: ignore[reportArgumentType]
 
 
@@ -267,20 +269,20 @@ def _set_aside(path: Path, damage: _Damage) -> None:
 
 
 def _sweep(path: Path) -> None:
-    """Remove what killed runs left half written in the folder of ``path``, whose lock is held."""
+    """Remove half-written files of killed runs from the folder of ``path``, whose lock is held."""
     for kind in _SUFFIXES:
         for left in path.parent.glob(f".*{kind}.*"):
             key = left.name[1:].rpartition(kind)[0]
             if key == path.stem:
                 left.unlink(missing_ok=True)
                 continue
-            # Left alone: what another run is writing, and what another user owns.
+            # Files that another run is writing, or that another user owns, are left alone.
             with suppress(Timeout, OSError), _lock(path.with_name(f"{key}.pt")).acquire(timeout=0):
                 left.unlink()
 
 
 def _write(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file, whole or not at all, with the permissions that new files have."""
+    """Write a file completely or not at all, with the permissions of a new file."""
     draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
     with _writing(path):
         try:
@@ -293,7 +295,7 @@ def _write(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Name the path where the system does not let it be written."""
+    """Turn an error of writing a file into one that names its path."""
     try:
         yield
     except OSError as error:
@@ -301,10 +303,10 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def to_bytes(images: Tensor) -> Tensor:
-    """Return images in [0, 1] as 0 to 255, as they are stored; on the CPU."""
+    """Return images in [0, 1] as integers from 0 to 255 on the CPU, as they are stored."""
     return (images.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
 def from_bytes(images: Tensor) -> Tensor:
-    """Return what ``to_bytes`` stored, as float32."""
+    """Return images stored by ``to_bytes`` as float32."""
     return images.to(torch.float32) / 255

@@ -1,4 +1,4 @@
-"""Which bins of an angle an object's symmetry makes the same, for reports."""
+"""Stage ``symmetry``: which bins of an angle look the same because an object is symmetric."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from neural_sim.types import PinholeCamera
 
 @dataclass(frozen=True)
 class SymmetryStage(Stage[list[list[int]]]):
-    """Groups of bins, numbered from 1, that look the same.
+    """Groups of bins, numbered from 1, in which an object looks the same.
 
-    ``content`` is the digest of the object; ``fields`` has the field of an object without a mesh.
+    ``content`` is the digest of the object; ``fields`` contains its field if it has no mesh.
     """
 
     phase: ClassVar[str] = "report"

@@ -27,8 +27,8 @@ _log = logging.getLogger(__name__)
 class TargetSets:
     """Disjoint parts of the target's labelled images.
 
-    Psi is learned on ``val``, ``test`` is scored once, and ``train`` trains detectors if ``training.real`` asks for it
-    (None: no such part).
+    Psi is learned on ``val``, final scores are measured on ``test``, and detectors are trained on ``train`` if
+    ``training.real`` asks for it (None: no such part).
     """
 
     val: LabelledImages
@@ -38,10 +38,10 @@ class TargetSets:
 
 @dataclass(frozen=True)
 class TargetSetsStage(Stage[TargetSets]):
-    """The sets of a configured target.
+    """The image sets of the configured target.
 
-    ``contents`` are the digests of the objects by name; ``fields`` stand in for meshes where the target renders objects
-    that have none.
+    ``contents`` are the digests of the objects by name; ``fields`` replace meshes if the target renders objects that
+    have none.
     """
 
     phase: ClassVar[str] = "target_sets"
@@ -65,7 +65,7 @@ class TargetSetsStage(Stage[TargetSets]):
     @property
     @override
     def early(self) -> bool:
-        return not self.target.renders  # photographs that cannot be used are refused at once
+        return not self.target.renders  # so that unusable photographs are refused at once
 
     @override
     def make(self, results: Results) -> TargetSets:

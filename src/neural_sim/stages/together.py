@@ -1,4 +1,4 @@
-"""Stages that need nothing of each other, made side by side by workers that share the store."""
+"""Make independent stages in parallel, by workers that share the store."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ _log = logging.getLogger(__name__)
 
 
 def make_together(results: Results, stages: Iterable[Stage[Any]], by: Workers, gpus: float = 0.0) -> None:
-    """Make what the store lacks of some stages and of what they need, each as soon as its own inputs are there.
+    """Make the stages, and those they need, that the store lacks, each as soon as its inputs are ready.
 
-    Results are those of one process bit for bit: every worker computes with as many threads as this one. Nothing is
-    made where no two of the stages could be made at one time.
+    Results equal those of one process bit for bit, since every worker uses as many threads as this one. Nothing is made
+    if no two of the stages could be made at the same time.
 
     Args:
-        results: whose store gets the results.
-        stages: what is wanted.
+        results: results whose store the workers share.
+        stages: stages to make.
         by: number of processes, or a cluster.
-        gpus: part of a GPU that a stage takes on a cluster.
+        gpus: fraction of a GPU that a stage takes on a cluster.
 
     Raises:
-        ValueError: as making the stages one after another, and for a cluster that cannot be used.
+        ValueError: making a stage raises it, or the cluster cannot be used.
     """
     if by == 1:
         return
     missing = {stage.entry: stage for stage in results.missing(stages) if stage.stored}
     waiting = {name: set(_needed(stage, missing)) for name, stage in missing.items() if _can_be_sent(stage)}
-    # What needs a stage that stays here stays here, too.
+    # A stage that needs one made by this process is made by this process, too.
     while kept := {name for name, needed in waiting.items() if not needed <= waiting.keys()}:
         waiting = {name: needed for name, needed in waiting.items() if name not in kept}
     if _most_at_once(waiting) < 2:
@@ -66,7 +66,7 @@ def make_together(results: Results, stages: Iterable[Stage[Any]], by: Workers, g
 
 
 class _Make:
-    """Makes stages in a process, which keeps what they share."""
+    """Makes stages in a worker, which keeps in memory what they share."""
 
     def __init__(self, store: Path, resume: bool) -> None:
         self._store, self._resume = store, resume
@@ -79,7 +79,7 @@ class _Make:
 
 
 def _needed(stage: Stage[Any], missing: Mapping[str, Stage[Any]]) -> Iterator[str]:
-    """Find the missing results that a stage needs, itself or through what is not stored."""
+    """Find the missing results that a stage needs, directly or through inputs that are not stored."""
     for needed in stage.needed:
         if needed.entry in missing:
             yield needed.entry
@@ -97,7 +97,7 @@ def _can_be_sent(stage: Stage[Any]) -> bool:
 
 
 def _most_at_once(needs: Mapping[str, set[str]]) -> int:
-    """Count the results that are as far from the first ones as each other, at most."""
+    """Return the largest number of results at the same depth of the graph, an estimate of how many run at once."""
     depth: dict[str, int] = {}
     while len(depth) < len(needs):
         for name, needed in needs.items():

@@ -16,11 +16,11 @@ PACKAGE = ROOT.name
 
 
 def code_version(modules: Iterable[str], root: Path = ROOT) -> str:
-    """Digest of the source of ``modules`` and of every module of this package that they import, at any depth.
+    """Return a digest of the source of ``modules`` and of all modules of this package that they import, at any depth.
 
-    Comments, layout and docstrings are left out, so that an edit of prose keeps stored results. Modules outside the
-    package count by their own source, without what they import; the standard library and installed packages that
-    cannot be read as source do not count.
+    Comments, layout and docstrings are left out, so that stored results survive edits of prose. Modules outside the
+    package count by their own source, without their imports; the standard library and installed packages without
+    readable source do not count.
     """
     total = hashlib.sha256()
     for name in sorted(closure(modules, root)):
@@ -31,7 +31,7 @@ def code_version(modules: Iterable[str], root: Path = ROOT) -> str:
 
 
 def closure(modules: Iterable[str], root: Path = ROOT) -> set[str]:
-    """``modules`` and all modules of the package under ``root`` that they import, directly or not."""
+    """Return ``modules`` and all modules of the package under ``root`` that they import, directly or not."""
     names: set[str] = set()
     waiting = [name for name in modules if _source(name, root) is not None]
     while waiting:
@@ -47,7 +47,7 @@ def closure(modules: Iterable[str], root: Path = ROOT) -> set[str]:
 
 @dataclass(frozen=True)
 class _File:
-    """What one source file means, and the modules of the package that it imports."""
+    """The normalised source of one file, and the modules of the package that it imports."""
 
     meaning: bytes
     imports: tuple[str, ...]
@@ -66,7 +66,7 @@ def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            # What is imported from a package may be a module or a name that its __init__ defines.
+            # A name imported from a package may be a module or defined in its __init__.
             names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         else:
             continue
@@ -76,10 +76,9 @@ def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
 
 
 def _text(node: object) -> str:
-    """Return a syntax tree as text, equal in all versions of Python.
+    """Return a syntax tree as text that is the same in all versions of Python.
 
-    Newer ones add fields, which are empty unless a file uses them (``ast.dump`` of 3.12 has ``type_params`` of every
-    function).
+    Empty fields are left out, because newer versions add some (``type_params`` of every function in 3.12).
     """
     if isinstance(node, ast.AST):
         fields = [(name, value) for name, value in ast.iter_fields(node) if value is not None and value != []]
@@ -90,7 +89,7 @@ def _text(node: object) -> str:
 
 
 def _source(name: str, root: Path) -> Path | None:
-    """Return the file of a module, None without one: builtins, extensions, names that are no modules."""
+    """Return the source file of a module; None for builtins, extensions and names that are not modules."""
     first, *rest = name.split(".")
     if first == root.name:
         place = root.joinpath(*rest)

@@ -1,4 +1,4 @@
-"""The objects of a run, of meshes or of photographs, and stage ``views``: what fields are fitted to."""
+"""The objects of a run, from meshes or photographs, and stage ``views`` with the views that fields are fitted to."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from neural_sim.synthesis.subjects import MeshSubject, PhotographedField, Render
 from neural_sim.types import PinholeCamera, PosedViews
 
 PHOTOGRAPH = 320
-"""Pixels along a shown photograph's longer side, about."""
+"""Approximate longer side, in pixels, of photographs on a page."""
 DIMMED = 0.25
-"""Brightness of what is not the object in a shown photograph."""
+"""Brightness of the background in photographs on a page."""
 
 
 @dataclass(frozen=True)
 class ViewsStage(Stage[PosedViews]):
-    """Views of one object. The run's seed has no part in them, so that runs share views and fields.
+    """Views of one object. They do not depend on the run's seed, so that runs share views and fields.
 
     Args:
-        object: its name.
-        content: digest of its mesh, or of its capture's files and options.
-        settings: of the views; where they are photographs, only the counts and the image size apply.
-        objects: all of the run.
-        masks: of photographs, where they are computed.
-        refinement: what corrects the poses of photographs.
+        object: name of the object.
+        content: digest of its mesh, or of the files and options of its capture.
+        settings: settings of the views; for photographs, only the counts and the image size apply.
+        objects: all objects of the run.
+        masks: masks of photographs, if they are computed.
+        refinement: refinement of the poses of photographs.
     """
 
     phase: ClassVar[str] = "views"
@@ -70,11 +70,11 @@ class ViewsStage(Stage[PosedViews]):
 
     @property
     def held_out(self) -> int:
-        """How many of the views, the last, only score the field."""
+        """Number of views, at the end, that are only used to score the field."""
         return self.objects.held_out(self.object, self.settings)
 
     def fitted(self, results: Results) -> PosedViews:
-        """Return the views that a field is fitted to, without those held out."""
+        """Return the views that a field is fitted to, without held-out ones."""
         views = results(self)
         return views.select(torch.arange(len(views) - self.held_out))
 
@@ -103,7 +103,7 @@ class ViewsStage(Stage[PosedViews]):
 
 @dataclass(frozen=True)
 class Objects(ABC):
-    """The objects of a run by name. What they are made of is known here alone."""
+    """The objects of a run by name. No other code depends on what they are made of."""
 
     source: Source
     has_meshes: ClassVar[bool]
@@ -111,7 +111,7 @@ class Objects(ABC):
 
     @staticmethod
     def of(source: MeshSource | Photos, views: Views) -> Objects:
-        """Return the objects of a configured source; meshes are rendered as ``views`` says."""
+        """Return the objects of a configured source; meshes are rendered with the settings in ``views``."""
         if not isinstance(source, Photos):
             return Meshes(source, views.backend, views.supersample)
         captures = Captures(source)
@@ -120,12 +120,12 @@ class Objects(ABC):
         return Mixed(source, captures, Meshes(source.beside, views.backend, views.supersample))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is computed from the fields: a process that gets the objects loads the meshes it renders."""
+        """Leave out cached properties: a process that receives the objects loads the meshes that it renders."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names, in the order of class labels."""
+        """The names, in label order."""
         return tuple(self.source.names())
 
     @cached_property
@@ -136,7 +136,7 @@ class Objects(ABC):
     @cached_property
     @abstractmethod
     def radii(self) -> dict[str, float | None]:
-        """Radii of the bounding spheres in metres by name, None where unknown."""
+        """Radii of the bounding spheres in metres by name, None if unknown."""
 
     @abstractmethod
     def subject(
@@ -147,44 +147,44 @@ class Objects(ABC):
         Args:
             name: name of the object.
             field: its radiance field, for objects without meshes.
-            rig: lights whose weights scenes may draw, for objects with meshes.
+            rig: lights with weights for scenes to draw, for objects with meshes.
         """
 
     @abstractmethod
     def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:
-        """Return an object's views, those held out last."""
+        """Return the views of an object, held-out ones last."""
 
     def held_out(self, name: str, settings: Views) -> int:
-        """Return how many of an object's views are held out."""
+        """Return the number of held-out views of an object."""
         return settings.held_out
 
     def part(self, name: str) -> Objects:
-        """Return the objects of the same kind that ``name`` is one of."""
+        """Return the objects of the same kind as ``name``."""
         return self
 
     @property
     def refuses_poor(self) -> bool:
-        """Whether nothing may train on fields that do not show their objects."""
+        """Whether training on fields that do not show their objects is refused."""
         return False
 
     def photographs(
         self, name: str, settings: Views, masks: MasksOfFrames, held_out: Sequence[int]
     ) -> tuple[Float[Tensor, "_ _ 3"], ...]:
-        """Return photographs of some held-out views, what is not the object dimmed; none of objects of meshes."""
+        """Return photographs of some held-out views with dimmed background; none for objects from meshes."""
         return ()
 
     def placed(self, name: str, settings: Views, views: PosedViews) -> Placed | None:
-        """Return where an object is in its capture; None for objects of meshes."""
+        """Return the position of an object in its capture; None for objects from meshes."""
         return None
 
     def stage(self, name: str, settings: Views) -> ViewsStage:
-        """Return the stage of an object's views."""
+        """Return the stage that makes the views of an object."""
         return ViewsStage(name, self.digests[name], settings, self)
 
 
 @dataclass(frozen=True)
 class Meshes(Objects):
-    """Objects of meshes, loaded when one is first rendered, and their renderer."""
+    """Objects from meshes, which are loaded when one is first rendered, and their renderer."""
 
     has_meshes: ClassVar[bool] = True
 
@@ -220,7 +220,7 @@ class Meshes(Objects):
 
 @dataclass(frozen=True)
 class Captures(Objects):
-    """Objects of photographs: they are rendered by their fields."""
+    """Objects from photographs, which are rendered by their fields."""
 
     has_meshes: ClassVar[bool] = False
 
@@ -263,7 +263,7 @@ class Captures(Objects):
         ]
         own = views.camera_to_world.double().numpy()
         given = np.stack([frame.camera_to_world for frame in frames])
-        # Views keep their cameras' places: one similarity takes all of them from the capture's frame to the object's.
+        # One similarity takes all cameras from the frame of the capture to that of the object, so one view gives it.
         turn = upright(np.array(self.source.up_of(name)), name)
         apart = [np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(0)) for poses in (given, own)]
         radius = float(apart[0] / apart[1])
@@ -286,7 +286,7 @@ class Captures(Objects):
 
 @dataclass(frozen=True)
 class Mixed(Objects):
-    """Objects of photographs, then those of meshes: classes of one detector."""
+    """Objects from photographs followed by objects from meshes, as classes of one detector."""
 
     has_meshes: ClassVar[bool] = False
 
@@ -329,7 +329,7 @@ class Mixed(Objects):
 
 
 def dimmed(rgba: Float[Tensor, "h w 4"]) -> Float[Tensor, "_ _ 3"]:
-    """Reduce a photograph, and dim what is not the object."""
+    """Reduce a photograph in size and dim its background."""
     pixels = rgba.movedim(-1, 0)[None]
     pixels = avg_pool2d(pixels, max(1, round(max(pixels.shape[2:]) / PHOTOGRAPH)))[0].movedim(0, -1)
     return pixels[..., :3] * (DIMMED + (1.0 - DIMMED) * pixels[..., 3:])
