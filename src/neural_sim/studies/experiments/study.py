@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -32,7 +31,6 @@ from neural_sim.tasks.context import Context, Task
 NOT_YET = "not yet measured"
 BY_FIGURES = "figures in the run's folder"
 IN_JSON = "All tables, and what the methods cost, are on the site (`nox -s docs`), from `experiments.json`."
-NO_WIDTH = re.compile(r"(\S+) \(\1 to \1\)")
 COMMAND = "python -m src.main +experiment=experiments_table experiments.page=docs/experiments.md"
 
 
@@ -219,9 +217,7 @@ class Experiments(Task):
             if own is None:
                 said.append(("Ours", [row.without_runs]))
             else:
-                lines = (
-                    [row.elsewhere] if row.elsewhere else [NO_WIDTH.sub(r"\1", line) for line in own.summary]
-                )
+                lines = [row.elsewhere] if row.elsewhere else own.summary
                 said.append((f"Ours, commit {', '.join(own.all_commits)}", lines))
             said.append(("What differs", [row.differs] if row.differs else []))
             points = [_point(title, lines) for title, lines in said if lines]
