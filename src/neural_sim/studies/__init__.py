@@ -1,1 +1,1 @@
-"""Studies: what a run measures beyond learning psi; one file or package each, with settings, measurement and `run`."""
+"""Studies, which measure something other than learning psi; each is a file or package with settings and a `run`."""

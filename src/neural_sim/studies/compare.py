@@ -1,4 +1,4 @@
-"""Study ``compare``: all methods of an experiment side by side, from finished runs; ``+experiment=compare``."""
+"""Study ``compare``: compare all methods of an experiment, using finished runs; ``+experiment=compare``."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ UNITS = {"images": "images", "seconds": "seconds", "cpu_seconds": "seconds of pr
 @validated
 @dataclass(frozen=True)
 class Compare(Task):
-    """Compare finished runs of MLflow experiments, each experiment by itself and at each gap.
+    """Compare finished runs of MLflow experiments, separately for each experiment and gap.
 
-    Leaves compare.md, compare.json, figures and report.html in the run's folder, and a run in MLflow.
+    Writes compare.md, compare.json, figures and report.html to the run's folder, and logs a run to MLflow.
 
     Args:
         experiments: MLflow experiments whose runs are compared.
         reference: the method that the others are compared with.
-        draws: of the bootstrap over test images.
-        clock: ``seconds`` on the wall, or ``cpu_seconds``, those of all cores together, for runs that shared a machine.
-        methods: these; null: all that have runs. Seeds are those that all of them have.
+        draws: bootstrap draws over test images.
+        clock: ``seconds`` of wall-clock time, or ``cpu_seconds`` of all cores together, for runs that shared a machine.
+        methods: methods to compare; null: all that have runs. Only seeds that all of them have are used.
     """
 
     experiments: Annotated[tuple[str, ...], MinLen(1)]
@@ -73,10 +73,10 @@ class Compare(Task):
         print(*lines, f"who is ahead? open {page}", sep="\n")
 
     def selected(self, runs: Runs) -> tuple[list[Group], tuple[LeftOut, ...]]:
-        """Return the groups of runs that are compared, and the runs that are left out.
+        """Return the groups of runs to compare, and the runs that are left out.
 
         Raises:
-            ValueError: no run of a named method, or none that can be compared, with the reasons.
+            ValueError: a named method has no run, or no run can be compared; the message has the reasons.
         """
         known = {run.results.get("method") for run in runs.rows}
         missing = sorted(set(self.methods or ()) - known)
@@ -95,14 +95,14 @@ class Compare(Task):
         return groups, left_out
 
     def table(self, group: Group, seed: int) -> Table:
-        """Compare the runs of one group; ``seed`` is of the bootstrap."""
+        """Compare the runs of one group; ``seed`` seeds the bootstrap."""
         comparison = compare(group.runs, self.reference, self.draws, seed, self.clock)
         return Table(group, dataclasses.replace(comparison, setting=group.label), costs(group.runs))
 
 
 @dataclass(frozen=True)
 class Table:
-    """One group of runs compared: a part of compare.md, of compare.json and of the page."""
+    """The comparison of one group of runs, a part of compare.md, compare.json and the page."""
 
     group: Group
     comparison: Comparison
@@ -113,7 +113,7 @@ class Table:
 
     @property
     def slug(self) -> str:
-        """The setting as part of a file's or a metric's name."""
+        """The setting in a form to use in names of files and metrics."""
         return self.group.label.replace(", ", "_").replace(" ", "_")
 
     @property
@@ -123,7 +123,7 @@ class Table:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The group's part of compare.json."""
+        """The entry of the group in compare.json."""
         runs = self.group.runs
         return {
             **dataclasses.asdict(self.comparison),
@@ -138,7 +138,7 @@ class Table:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Scores of the methods by their names in MLflow."""
+        """Scores of the methods, by MLflow metric name."""
         c = self.comparison
         return {f"{self.slug}/{method}/{c.score.lower()}": c.ap[method].value for method in c.methods}
 
@@ -159,27 +159,27 @@ class Table:
 
     @property
     def verdict(self) -> str:
-        """One sentence: whom the reference is ahead of, and whom not."""
+        """One sentence that says which methods the reference is ahead of, and which not."""
         return verdict(self.comparison)
 
     @property
     def warning(self) -> str:
-        """What the scores at fewer seconds do not tell; empty if they do."""
+        """Warning about what scores at smaller budgets cannot tell; empty if there is nothing to warn of."""
         return ONLY_AT_END if self.comparison.only_at_end else ""
 
     @property
     def cautions(self) -> list[str]:
-        """What a reader must know before all else."""
+        """What a reader must know before reading the scores."""
         return cautions(self.group.runs)
 
     @property
     def in_full(self) -> str:
-        """The score's name."""
+        """The full name of the score."""
         return IN_FULL[self.comparison.score]
 
     @property
     def longest(self) -> float:
-        """The largest score of the table, to which bars are drawn."""
+        """The largest score in the table, which sets the scale of the bars."""
         return max((estimate.value for estimate in self.comparison.ap.values()), default=1.0) or 1.0
 
 
@@ -190,7 +190,7 @@ def compare_markdown(tables: Sequence[Table], left_out: Sequence[LeftOut]) -> st
 
 
 def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
-    """Return a section of compare.md; none where every run was compared."""
+    """Return the section of compare.md on left-out runs; nothing if every run was compared."""
     if not left_out:
         return []
     rows = [(", ".join(runs), reason.replace("\n", " ")) for reason, runs in by_reason(left_out).items()]
@@ -201,8 +201,8 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
     """Return the table of one setting, its differences, the distances of the learned distributions, and costs.
 
     Args:
-        comparison: of the runs.
-        runs: one of each method at each seed.
+        comparison: comparison of the runs.
+        runs: one run of each method at each seed.
         heading: how these runs differ from others of the setting.
     """
     c = comparison
@@ -258,7 +258,7 @@ def _scores_table(c: Comparison) -> str:
 
 
 def _leads(c: Comparison) -> list[str]:
-    """Return the reference's lead by budget and a note; nothing without another method."""
+    """Return a table of the reference's lead by budget, with a note; nothing if there is no other method."""
     if not c.ahead_at:
         return []
     head = [f"{c.reference} ahead after so many {_unit(c)}, of", *(f"{budget:.0f}" for budget in c.budgets)]
@@ -268,13 +268,13 @@ def _leads(c: Comparison) -> list[str]:
 
 
 def cautions(runs: Sequence[FinishedRun]) -> list[str]:
-    """Return what a reader must know before the scores, of runs of a scale whose scores mean nothing."""
+    """Return warnings to put before the scores: runs at a scale at which scores mean nothing."""
     scales = dict.fromkeys(run.results.get("scale", "") for run in runs)
     return [said for scale in scales if (said := caution(scale))]
 
 
 def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
-    """Return a warning where the seconds of a table come from devices of several kinds."""
+    """Return a warning if the seconds in a table come from different kinds of devices."""
     kinds: dict[str, list[str]] = {}
     for run in runs:
         kind = run.results["config"]["trainer"]["accelerator"]
@@ -286,7 +286,7 @@ def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
 
 
 def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]:
-    """Return mean distances of every biased object and factor; nothing where the target is not known."""
+    """Return mean distances of every biased object and factor; nothing if the target is unknown."""
     rows = []
     table = {(run.method, run.seed): run.results["total_variation"] for run in runs}
     for name in runs[0].results["biased"]:
@@ -302,7 +302,7 @@ def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]
 
 
 def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
-    """Draw the biased objects' score against images and against seconds, a line a seed."""
+    """Draw the score of the biased objects against images and against seconds, one line per seed."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     figure.suptitle(comparison.setting, color=figures.INK, fontsize=11)
     for place, key in enumerate(("images", comparison.clock), 1):
@@ -311,7 +311,7 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
             colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
             for line, run in enumerate(run for run in runs if run.method == method):
                 spent = [point[key] for point in run.results["curve"]]
-                # In steps: worth what it has reached, as in the area.
+                # A step function, as for the area under it: at any time a method has the score it has reached so far.
                 axes.plot(
                     spent, 100 * biased_ap(run, comparison.clock)[1], ".-", drawstyle="steps-post", color=colour,
                     alpha=0.7, linewidth=1, label=method if line == 0 else None,
@@ -320,7 +320,7 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
             axes.axhline(100 * comparison.ap[bound].value, color=figures.MUTED, linestyle=style, linewidth=1)
             axes.annotate(bound, (1.0, 100 * comparison.ap[bound].value), xycoords=("axes fraction", "data"),
                           ha="right", va="bottom", fontsize=7, color=figures.MUTED)  # fmt: skip
-        # The start, where nothing is spent yet, has a place too.
+        # The start has zero cost, which a logarithmic axis would not show.
         least = [point[key] for run in runs for point in run.results["curve"] if point[key] > 0]
         axes.set_xscale("symlog", linthresh=min(least, default=1))
         label = f"{comparison.score} of the biased objects (%)"
@@ -333,9 +333,9 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
 
 
 def verdict(comparison: Comparison) -> str:
-    """Say whom the reference is ahead of by its score at the end, and whom it cannot be told apart from.
+    """Say which methods the reference is ahead of in final score, and which it cannot be told apart from.
 
-    Of one seed it says that intervals leave out how much trainings differ.
+    For a single seed it adds that the intervals do not include the scatter between trainings.
     """
     c = comparison
     reached = c.ap[c.reference]

@@ -30,10 +30,10 @@ Detections = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Judged:
-    """Detections of one image, best first.
+    """The detections in one image, best first.
 
-    ``kept`` are those that count, ``right`` says which of them lie on a box of their class, and ``missed`` which true
-    boxes have none.
+    ``kept`` marks the detections that count, ``right`` those of them that match a box of their class, and ``missed``
+    the ground-truth boxes without a match.
     """
 
     kept: Int[Tensor, "d"]
@@ -43,7 +43,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class Counts:
-    """One method's detections and missed boxes over all test images."""
+    """Numbers of correct and wrong detections and of missed boxes of one method, over all test images."""
 
     right: int
     wrong: int
@@ -52,7 +52,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class Found:
-    """What one method's detector found on the test images, and its score there."""
+    """The detections of one method's detector on the test images, and its score there."""
 
     detections: Sequence[Detections]
     ap: AveragePrecision
@@ -67,7 +67,7 @@ class DetectionGallery(Task):
         methods: baselines; the detector of each is trained on the distribution that it learned.
         count: photographs, evenly spaced over the test images.
         draw_above: smallest score of a detection that is drawn and counted.
-        overlap: smallest intersection over union of a right detection with a box of its class.
+        overlap: smallest intersection over union of a correct detection with a box of its class.
     """
 
     methods: Methods = ("ns", "neural_sim")
@@ -129,10 +129,10 @@ class DetectionGallery(Task):
 def judge(
     found: Detections, boxes: Float[Tensor, "b 4"], labels: Int[Tensor, "b"], above: float, overlap: float
 ) -> Judged:
-    """Tell right detections of one image from wrong ones.
+    """Tell correct detections in one image from wrong ones.
 
-    The best detection first, each takes the free box of its class that it overlaps most, by ``overlap`` or more; a
-    second detection of a box is wrong.
+    Starting with the best, each detection is matched to the free box of its class that it overlaps most, by at least
+    ``overlap``; further detections of the same box are wrong.
     """
     order = found["scores"].argsort(descending=True, stable=True)
     kept = order[found["scores"][order] >= above]
@@ -158,7 +158,7 @@ def judged(found: Sequence[Detections], test: LabelledImages, above: float, over
 
 
 def count(images: Sequence[Judged]) -> Counts:
-    """Count right and wrong detections, and missed boxes."""
+    """Count correct and wrong detections, and missed boxes."""
     right = sum(int(each.right.sum()) for each in images)
     kept, missed = sum(len(each.kept) for each in images), sum(int(each.missed.sum()) for each in images)
     return Counts(right, kept - right, missed)
@@ -171,7 +171,7 @@ def detections_figure(
     class_names: Sequence[str],
     rows: Int[Tensor, "n"],
 ) -> Figure:
-    """Draw a row for each method, a column for each of the test images ``rows``."""
+    """Draw one row per method and one column for each of the test images ``rows``."""
     height, width = test.images.shape[-2:]
     side = 2.1
     figure = Figure(

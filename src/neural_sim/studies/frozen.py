@@ -1,4 +1,4 @@
-"""One state of the psi loop (psi, detector and v), in which estimators are compared with a reference."""
+"""A frozen state of the psi loop (psi, detector and v) for comparing estimators with a reference."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class FrozenLoop:
 
     @staticmethod
     def of(context: Context, seed: int) -> FrozenLoop:
-        """Return the loop at its start: images of the initial psi, the warm-started detector, v by the run's solver."""
+        """Return the loop at its start: initial psi, warm-started detector, and v from the run's solver."""
         graph, results, generator = context.graph, context.results, torch.Generator().manual_seed(seed)
         psi, scene = graph.psi("initial"), results(graph.scene)
         images = scene.training_set(psi, context.experiment.loop.outer.images_per_object, generator).images
@@ -88,7 +88,7 @@ class FrozenLoop:
         return FrozenLoop(scene, detector, backbone, trainable, vector, psi, solve)
 
     def with_factor(self, factor: BinnedFactor) -> FrozenLoop:
-        """Return the same state with ``factor``, of the same bins, as the distribution's only one."""
+        """Return the same state with ``factor``, which has the same bins, as the only factor."""
         distribution = replace(self.scene.distribution, factors=(factor,))
         return replace(self, scene=replace(self.scene, distribution=distribution))
 
@@ -149,7 +149,7 @@ class FrozenLoop:
 
 
 def centred(derivatives: list[MixedDerivative]) -> Float[Tensor, "objects k"]:
-    """Return derivatives by centred logits: a constant added to all logits does not change p."""
+    """Return derivatives with respect to centred logits, since adding a constant to all logits does not change p."""
     values = torch.stack([part.value for part in derivatives])
     return values - values.mean(-1, keepdim=True)
 

@@ -1,4 +1,4 @@
-"""The experiments that a study compares: the same one with other seeds, with other methods, with other target sets."""
+"""Variants of an experiment for studies to compare: with other seeds, other methods or other target sets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def graphs_of_methods(context: Context, methods: Sequence[str], key: str) -> dic
     """Compose the same command with each ``baseline=...``; all are built here, so that bad ones are refused at once.
 
     Raises:
-        ValueError: an unknown method, or a context that cannot compose; ``key`` is the setting's name.
+        ValueError: a method is unknown, or the context cannot compose; the message names the setting ``key``.
     """
     if context.of_method is None:
         raise ValueError(f"{key}: this context composes no other method's configuration")
@@ -29,10 +29,10 @@ def graphs_of_methods(context: Context, methods: Sequence[str], key: str) -> dic
 
 
 def graphs_of_seeds(context: Context, seeds: int) -> list[Graph]:
-    """Return the experiment's stages for the run's seed and those that follow it.
+    """Return the stages of the experiment for the run's seed and the following ones.
 
     Raises:
-        ValueError: a task other than detection.
+        ValueError: the task is not detection.
     """
     x = context.experiment
     x.check_boxes("a comparison of sources of images")
@@ -40,7 +40,7 @@ def graphs_of_seeds(context: Context, seeds: int) -> list[Graph]:
 
 
 def sets_of_kinds(graph: Graph, kinds: Mapping[str, Sequence[int]]) -> dict[str, TargetSetsStage]:
-    """Return the target sets with other numbers of objects an image, by the name of each kind."""
+    """Return target sets with other numbers of objects per image, by the name of each kind."""
     synthesis = graph.experiment.imaging.synthesis
     return {
         kind: replace(graph.targets, synthesizer=replace(synthesis, objects_per_image=tuple(count)))

@@ -75,9 +75,9 @@ class Temperatures(Task):
 
     Args:
         values: the temperatures tau.
-        rounds: estimates at each tau, from ``outer.images_per_object`` images each.
-        truth_per_bin: images of every bin for the truth.
-        draws: relaxed draws of a bin, for the frequencies.
+        rounds: number of estimates at each tau, from ``outer.images_per_object`` images each.
+        truth_per_bin: images per bin for the reference derivative.
+        draws: number of relaxed draws for the frequencies of bins.
     """
 
     values: Annotated[tuple[Positive, ...], MinLen(1)] = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
@@ -105,7 +105,7 @@ class Temperatures(Task):
     def measure(
         self, loop: FrozenLoop, estimator: PathwiseEstimator, images: int, seed: int
     ) -> tuple[list[AtTemperature], list[Truth]]:
-        """Hold estimates from ``images`` images at every temperature against the truth, object by object."""
+        """Compare estimates from ``images`` images at every temperature with the reference, object by object."""
         names, bins = loop.scene.names, loop.bins.bins
         hard = loop.truth(self.truth_per_bin, torch.Generator().manual_seed(seed))
         truth, errors = centred(hard), torch.stack([part.standard_error for part in hard])
@@ -182,7 +182,7 @@ def publish(context: Context, rows: Sequence[AtTemperature], truths: Sequence[Tr
 
 
 def table(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> str:
-    """Return Markdown; everything is relative to the length of the truth."""
+    """Return Markdown with errors relative to the norm of the reference."""
     parts = [
         f"Estimates of d/dpsi <dL_train/dtheta, v> from {rows[0].images} images, in lengths of the derivative over "
         "hard bins."
@@ -209,12 +209,12 @@ def table(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> str:
 
 
 def agreement(row: AtTemperature, truth: Truth) -> float:
-    """Return 1 - total variation between where relaxed draws lie and p."""
+    """Return 1 minus the total variation between the frequencies of relaxed draws and p."""
     return 1.0 - 0.5 * float(np.abs(np.subtract(row.frequencies, truth.probabilities)).sum())
 
 
 def temperature_figure(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> Figure:
-    """Draw for each object where relaxed draws lie at every temperature and by p, and below that bias and spread."""
+    """Draw for each object the bins of relaxed draws at every temperature next to p, and bias and spread below."""
     figure = Figure(figsize=(3.6 * len(truths) + 0.6, 5.6), layout="constrained")
     grid = figure.subplots(2, len(truths), squeeze=False)
     for column, truth in enumerate(truths):

@@ -27,7 +27,7 @@ from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PinholeCamera
 
 UNCHANGED = 1e-6
-"""Largest difference of opacity between lights that counts as none."""
+"""Differences in opacity between lights up to this one count as none."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class Interpolation(Task):
     Args:
         ends: numbers of the two anchor lights, from 1.
         steps: number of images, the ends included.
-        image_size: in pixels.
-        phi_deg: the camera's first angle in degrees, see ``neural_sim.cameras.orbit``.
-        rho_deg: its second angle in degrees.
-        distance: its distance in object radii.
+        image_size: side of the images in pixels.
+        phi_deg: first angle of the camera in degrees, see ``neural_sim.cameras.orbit``.
+        rho_deg: second angle of the camera in degrees.
+        distance: distance of the camera in object radii.
     """
 
     ends: Annotated[tuple[PositiveInt, PositiveInt], Distinct()] = (1, 5)
@@ -97,11 +97,11 @@ def interpolate(
     ends: tuple[Float[Tensor, "k"], Float[Tensor, "k"]],
     steps: int = 7,
 ) -> InterpolatedViews:
-    """Render views over white from one camera under ``steps`` weights evenly spaced between two ends, these included.
+    """Render views over white from one camera under ``steps`` evenly spaced weights, from one end to the other.
 
     Raises:
-        ValueError: fewer than two steps.
-        RuntimeError: opacity changes by more than ``UNCHANGED``, although the colour head must not reach the density.
+        ValueError: there are fewer than two steps.
+        RuntimeError: opacity changes by more than ``UNCHANGED``, although the light must not affect the density.
     """
     if steps < 2:
         raise ValueError(f"interpolate: want at least 2 steps, got {steps}")
@@ -128,7 +128,7 @@ def publish(context: Context, views: Mapping[str, InterpolatedViews], title: str
 
 
 def table(views: Mapping[str, InterpolatedViews], title: str) -> str:
-    """Return Markdown: how much colour and opacity change on the way."""
+    """Return a Markdown table of how much colour and opacity change between the lights."""
     count = len(next(iter(views.values())).images)
     head = ["object", "largest change of opacity", "mean change of colour from the first light to the last"]
     rows = [
@@ -140,7 +140,7 @@ def table(views: Mapping[str, InterpolatedViews], title: str) -> str:
 
 
 def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> Figure:
-    """Draw a row for each object, from its first light on the left to its second on the right."""
+    """Draw one row per object, from the first light on the left to the second on the right."""
     count, height, width = next(iter(views.values())).images.shape[:3]
     canvas = np.concatenate(
         [np.concatenate(list(row.images.cpu().numpy()), axis=1) for row in views.values()], axis=0

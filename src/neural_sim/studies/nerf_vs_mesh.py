@@ -35,18 +35,18 @@ class NerfVsMesh(Task):
     Both have the same poses and distances, and are scored on images of one and of several objects.
 
     Args:
-        single: fewest and most objects of a test image, in the first test set.
-        multiple: the same in the second.
-        seeds: how many detectors of each kind, from the run's seed on.
-        blenderproc: a folder of BlenderProc's COCO output, whose images take the place of the mesh renderer's; None:
-            the mesh renderer.
-        categories: its category names -> object names, null to leave a category out. Names not listed stand for
-            themselves.
-        draws: of the bootstrap over test images.
-        shown: training images of each kind in the figure.
+        single: fewest and most objects per image in the first test set.
+        multiple: fewest and most objects per image in the second test set.
+        seeds: number of detectors of each kind; seeds count up from the run's.
+        blenderproc: folder of COCO output by BlenderProc, which replaces the images of the mesh renderer; None: the
+            mesh renderer.
+        categories: category names of BlenderProc -> object names, null to leave a category out. Categories not listed
+            are objects of the same name.
+        draws: bootstrap draws over test images.
+        shown: number of training images of each kind in the figure.
 
     Raises:
-        ValueError: a folder without BlenderProc's annotations.
+        ValueError: the folder has no BlenderProc annotations.
     """
 
     single: Annotated[tuple[NonNegativeInt, PositiveInt], Ascending()] = (1, 1)
@@ -96,11 +96,11 @@ class NerfVsMesh(Task):
         publish(context, found, shown, names, heading)
 
     def tests(self, graph: Graph) -> dict[str, TargetSetsStage]:
-        """Return the test sets by their names."""
+        """Return the test sets by name."""
         return sets_of_kinds(graph, {"single": self.single, "multiple": self.multiple})
 
     def sources(self, graph: Graph) -> dict[str, DetectorStage]:
-        """Return the detectors that are compared, by what their images show."""
+        """Return the detectors to compare, by the source of their training images."""
         nerf = graph.synthetic(graph.psi("target"), "images of the fields")
         if self._rendered is not None:
             loaded = LoadedImagesStage(self._rendered, graph.names, graph.camera)

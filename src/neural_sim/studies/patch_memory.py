@@ -34,7 +34,7 @@ FORWARD, WHOLE = "forward", "reverse, whole image"
 
 @dataclass(frozen=True)
 class PatchCost:
-    """One way to differentiate one image of an object by the numbers of its draw that depend on psi.
+    """Cost of one way to differentiate an image of an object with respect to the scene parameters that psi moves.
 
     Attributes:
         object: the object's name.
@@ -65,8 +65,8 @@ class PatchMemory(Task):
     """``+experiment=patch_memory``.
 
     Args:
-        patches: rays per patch of the reverse mode.
-        repeats: timings, whose median counts.
+        patches: patch sizes in rays, for reverse mode.
+        repeats: number of timings; their median is reported.
     """
 
     patches: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64, 128, 256, 512)
@@ -86,7 +86,7 @@ class PatchMemory(Task):
         publish(context, rows, setting)
 
     def measure(self, loop: FrozenLoop, estimator: PathwiseEstimator, seed: int) -> list[PatchCost]:
-        """Measure every object: forward mode, reverse mode by each patch size and by the whole image at once."""
+        """Measure forward mode, and reverse mode with every patch size and on the whole image, for every object."""
         pixels = loop.scene.camera.width * loop.scene.camera.height
         sizes = [*(size for size in self.patches if size < pixels), pixels]
         ahead = replace(estimator, mode="forward")
@@ -113,7 +113,7 @@ class PatchMemory(Task):
         return peak_bytes(lambda: loop.pathwise(estimator, 1, _generator(seed)), device) / 2**20
 
     def _timed(self, run: Callable[[], object], device: torch.device) -> tuple[float, float]:
-        """Return median milliseconds, of wall time and of processor time."""
+        """Return median milliseconds of wall-clock time and of CPU time."""
         wall, worked = [], []
         for _ in range(self.repeats):
             begun, cpu_begun = time.perf_counter(), time.process_time()
@@ -135,7 +135,7 @@ def _estimator(context: Context) -> PathwiseEstimator:
 
 @dataclass(frozen=True)
 class _Image:
-    """One image of one object, and the loss's cotangent of its maps; each rendering repeats the draw from the seed."""
+    """One image of one object with the cotangent of its maps; each render repeats the same draw."""
 
     loop: FrozenLoop
     label: int
@@ -189,7 +189,7 @@ def _generator(seed: int) -> torch.Generator:
 
 
 def _apart(values: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> float:
-    """Return the distance over the numbers that ``truth`` has, relative to its norm."""
+    """Return the distance between two derivatives, relative to the norm of ``truth``."""
     one, other = (torch.cat([each[name] for name in truth]) for each in (values, truth))
     return float((one - other).norm() / other.norm())
 
@@ -207,7 +207,7 @@ def publish(context: Context, rows: Sequence[PatchCost], setting: str) -> Run | 
 
 
 def table(rows: Sequence[PatchCost], setting: str) -> str:
-    """Return Markdown, a table for each object."""
+    """Return Markdown with one table per object."""
     parts = [
         f"Derivative of one image by the scene parameters that depend on psi ({setting}). *Gradient* is the working "
         "memory of the renderer's derivative, *total* that of the whole estimate with the detector's, from one image "

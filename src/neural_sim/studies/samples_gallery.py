@@ -1,4 +1,4 @@
-"""Training images drawn from what each method learned, and test images (the paper's Sec. C.1)."""
+"""Training images drawn from the distribution that each method learned, next to test images (Sec. C.1)."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class Samples:
-    """One object: images by method, and test images.
+    """Images of one object by method, and test images.
 
-    ``distances`` are by method the total variation of each factor's learned distribution to the target's, None where
+    ``distances`` are, by method, the total variation between learned and target distribution of each factor, None if
     the target's is unknown.
     """
 
@@ -43,10 +43,10 @@ class SamplesGallery(Task):
     """``+experiment=samples_gallery``.
 
     Args:
-        methods: baselines whose psi is learned, with the settings that each would have in a run of its own.
-        count: images of each object.
-        columns: images in a row.
-        objects: names of the objects that are shown; None: those with a biased start.
+        methods: baselines that learn psi, each with its own settings.
+        count: number of images of each object.
+        columns: number of images per row.
+        objects: names of the objects to show; None: those with a biased start.
     """
 
     methods: Methods = ("neural_sim", "auto_sim")
@@ -86,7 +86,7 @@ class SamplesGallery(Task):
         generator = torch.Generator().manual_seed(graph.experiment.run.seed)
         rendered = results(graph.scene).training_set(psi, self.count, generator)
         images = rendered.images.to("cpu")
-        # Where an image shows several objects, these are the ones drawn for this object.
+        # If images show several objects, these are the ones drawn for this object.
         return [
             images.select(torch.arange(label * self.count, (label + 1) * self.count))
             for label in range(len(graph.names))
@@ -100,7 +100,7 @@ class SamplesGallery(Task):
 
 
 def _distance(graph: Graph, psi: Psi, label: int) -> dict[str, float] | None:
-    """Return the total variation to the target by factor; None where the target's p is not known."""
+    """Return the total variation from the target by factor; None if the target's p is unknown."""
     imaging, target = graph.experiment.imaging, graph.target_psi
     if target is None:
         return None
@@ -129,7 +129,7 @@ def publish(context: Context, samples: Sequence[Samples], columns: int) -> Run |
 
 
 def table(samples: Sequence[Samples]) -> str:
-    """Return Markdown: distances by object and factor."""
+    """Return a Markdown table of distances by object and factor."""
     methods = list(samples[0].images)
     rows = [
         [
@@ -144,7 +144,7 @@ def table(samples: Sequence[Samples]) -> str:
 
 
 def samples_figure(samples: Samples, columns: int) -> Figure:
-    """Draw a panel for each method and one of test images, each of rows of ``columns`` images."""
+    """Draw one panel per method and one with test images, with ``columns`` images per row."""
     panels = {
         method: (images, _caption(samples.distances[method])) for method, images in samples.images.items()
     }

@@ -33,15 +33,15 @@ from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PosedViews
 
 UNLIT = Lighting(lights=(), ambient=1.0)
-"""The colours of a reconstruction have the light of its views."""
+"""The colours of a reconstruction already contain the light of its views."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """One object on views that neither its field nor its reconstruction has seen.
+    """One object in views that neither its field nor its reconstruction has seen.
 
-    ``images`` are the first such view as it is (``view``) and by each source, over white; ``scores`` are each source's
-    ``psnr``, ``psnr_foreground`` (dB) and ``ssim`` on all of them.
+    ``images`` are the first such view itself (``view``) and its renders by each source, over white; ``scores`` are the
+    ``psnr``, ``psnr_foreground`` (dB) and ``ssim`` of each source over all these views.
     """
 
     object: str
@@ -52,13 +52,13 @@ class HeldOut:
 @validated
 @dataclass(frozen=True)
 class SfmVsNerf(Task):
-    """``+experiment=sfm_vs_nerf``: what a reconstructed mesh lacks that a field has.
+    """``+experiment=sfm_vs_nerf``: compare fields with reconstructed meshes.
 
     Args:
-        resolution: cells of the reconstruction along the unit sphere's diameter.
-        seeds: how many detectors of each kind, from the run's seed on.
-        draws: of the bootstrap over test images.
-        shown: training images of each kind in the figure.
+        resolution: cells of the reconstruction along the diameter of the unit sphere.
+        seeds: number of detectors of each kind; seeds count up from the run's.
+        draws: bootstrap draws over test images.
+        shown: number of training images of each kind in the figure.
     """
 
     resolution: Resolution = 128
@@ -127,7 +127,7 @@ def _as_seen(subject: RenderedSubject, views: PosedViews) -> Float[Tensor, "view
 
 
 def held_out_table(objects: Sequence[HeldOut]) -> str:
-    """Return Markdown: PSNR of whole images and of the object's pixels, by object and their mean."""
+    """Return a Markdown table of the PSNR of whole images and of the object's pixels, by object and on average."""
     sources = list(objects[0].scores)
     rows = {
         each.object: [each.scores[s][key] for s in sources for key in ("psnr", "psnr_foreground")]
@@ -141,7 +141,7 @@ def held_out_table(objects: Sequence[HeldOut]) -> str:
 
 
 def held_out_figure(objects: Sequence[HeldOut]) -> Figure:
-    """Draw a column for each object, a row for its view and for each source."""
+    """Draw one column per object, with a row for its view and one for each source."""
     rows = list(objects[0].images)
     figure = Figure(figsize=(1.6 * len(objects) + 0.5, 1.75 * len(rows) + 0.5), layout="constrained")
     grid = figure.subplots(len(rows), len(objects), squeeze=False)

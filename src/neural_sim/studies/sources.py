@@ -1,4 +1,4 @@
-"""AP of detectors trained on images of several sources, seed by seed: what nerf_vs_mesh and sfm_vs_nerf share."""
+"""AP of detectors trained on images from several sources, paired by seed; shared by nerf_vs_mesh and sfm_vs_nerf."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Scores of every source's detectors, by test set.
+    """Scores of the detectors trained on each source, by test set.
 
     Attributes:
         sources: names of the sources of training images.
-        seeds: of the detectors.
-        images: the number of test images, of all seeds together.
-        ap: every source's mean over classes and seeds.
-        ahead: by how much the first source exceeds each other one.
-        per_class: every source's AP by class, the mean over seeds.
+        seeds: seeds of the detectors.
+        images: number of test images, over all seeds.
+        ap: mean AP of each source over classes and seeds.
+        ahead: lead of the first source over each other source.
+        per_class: AP of each source by class, mean over seeds.
     """
 
     sources: tuple[str, ...]
@@ -67,16 +67,16 @@ def compare_sources(
     tests: Callable[[Graph], Mapping[str, TargetSetsStage]],
     draws: int,
 ) -> SideBySide:
-    """Score every source's detector of every seed on every test set; the others are compared with the first source.
+    """Score the detectors of every source and seed on every test set, and compare the first source with the others.
 
-    All sources of a seed are scored on the same test images, so that differences are paired.
+    All detectors of a seed are scored on the same test images, so that differences are paired.
 
     Args:
-        graphs: one a seed.
-        results: of stages.
-        sources: a graph's detectors by the source of their images.
-        tests: a graph's target sets by kind.
-        draws: of the bootstrap over test images.
+        graphs: one graph per seed.
+        results: results of stages.
+        sources: returns the detectors of a graph, by the source of their images.
+        tests: returns the target sets of a graph, by kind.
+        draws: bootstrap draws over test images.
     """
     outcomes: dict[str, dict[str, list[list[Outcomes]]]] = {}
     images: dict[str, int] = {}
@@ -96,9 +96,9 @@ def compare_sources(
 def training_images(
     graph: Graph, results: Results, sources: Mapping[str, DetectorStage], count: int
 ) -> LabelledImages:
-    """Return ``count`` training images of every source, source by source, spread evenly over those of each.
+    """Return ``count`` evenly spaced training images of every source, source by source.
 
-    Where the sources share their draws, the images show the same scenes.
+    If the sources share their draws, the images show the same scenes.
     """
     parts = []
     for stage in sources.values():
@@ -110,7 +110,7 @@ def training_images(
 
 @dataclass(frozen=True)
 class More:
-    """What a study adds to the tables and figures of its sources."""
+    """Tables and figures that a study adds to those of its sources."""
 
     document: Mapping[str, object] = dataclasses.field(default_factory=dict)
     text: str = ""
@@ -125,15 +125,15 @@ def publish(
     heading: str,
     more: More | None = None,
 ) -> Run | None:
-    """Write the table, the document and the figures, and log every source's AP to MLflow.
+    """Write the table, the document and the figures, and log the AP of every source to MLflow.
 
     Args:
-        context: the study's.
+        context: context of the study.
         found: the scores.
         shown: training images of every source, source by source.
         classes: names of the classes.
-        heading: what the sources are.
-        more: what is added.
+        heading: sentence that introduces the sources.
+        more: further tables and figures.
     """
     more = more or More()
     rows = "; ".join(f"row {i + 1}: {source}" for i, source in enumerate(found.sources))
@@ -155,7 +155,7 @@ def publish(
 
 
 def table(found: SideBySide, heading: str) -> str:
-    """Return Markdown: AP by test set with the leads of the first source, and AP by class."""
+    """Return Markdown tables of AP by test set, with the leads of the first source, and of AP by class."""
     first, *others = found.sources
     several = len(found.seeds) > 1
     over = "seeds and test images" if several else "test images"
@@ -184,7 +184,7 @@ def table(found: SideBySide, heading: str) -> str:
 
 
 def ap_figure(found: SideBySide, title: str) -> Figure:
-    """Draw a group of bars for each test set, one bar a source, with the intervals."""
+    """Draw one group of bars per test set and one bar per source, with intervals."""
     kinds = list(found.ap)
     figure = Figure(figsize=(1.9 * len(kinds) + 3.2, 3.2), layout="constrained")
     axes = figure.add_subplot()

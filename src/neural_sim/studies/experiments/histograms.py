@@ -1,4 +1,4 @@
-"""Learned and target distributions (the paper's Fig. 7) and total variation over seeds; equal-looking bins are one."""
+"""Learned and target distributions (the paper's Fig. 7) and total variation over seeds; bins that look alike merge."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from neural_sim.studies.experiments.settings import Setting, modes
 
 @dataclass(frozen=True)
 class Histogram:
-    """One factor of one object at one start.
+    """Distributions of one factor of one object, from one start.
 
     Args:
         experiment: experiment of the runs.
         name: name of the object.
         factor: the learned factor.
-        start: the initial distribution in short.
-        aim: the target's distribution in short.
+        start: short name of the initial distribution.
+        aim: short name of the target distribution.
         seeds: seeds of the runs.
-        groups: bins, from 1, that look the same.
+        groups: groups of bins, numbered from 1, that look the same.
         p: initial, target and learned probabilities.
-        distance: mean total variation of initial and learned to the target.
-        commits: commits of the runs' code.
+        distance: mean total variation from the target, of the initial and of the learned distribution.
+        commits: code commits of the runs.
     """
 
     experiment: str
@@ -77,7 +77,7 @@ def _histogram(setting: Setting, name: str, factor: str) -> Histogram:
 
 
 def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
-    """Draw a panel a start: initial, learned (mean over seeds, with smallest and largest) and target probabilities."""
+    """Draw one panel per start: initial, learned (mean, smallest and largest over seeds) and target probabilities."""
     columns = min(3, len(all_of))
     rows = -(-len(all_of) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.4 * rows + 0.6), layout="constrained")

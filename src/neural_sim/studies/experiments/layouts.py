@@ -1,4 +1,4 @@
-"""What is shown of an experiment's finished runs: lines for the table of experiments, a table of its own, figures."""
+"""Layouts of the results of finished runs: lines for the table of experiments, separate tables, and figures."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from neural_sim.studies.experiments.settings import MEAN, Setting, called
 
 NONE = "none"
 WAYS = {NONE: "synthetic alone", "pretrain": "synthetic, then photographs", "combined": "both together"}
-"""Ways in which photographs train, by ``training.real.mode``, in the order of a table's rows."""
+"""Ways of training with photographs, by ``training.real.mode``, in the order of table rows."""
 ALONE = {"real_only": "photographs alone", "views_only": "views of the fields alone"}
-"""Rows of detectors that no synthetic images train, first in a table."""
+"""Detectors trained without synthetic images, whose rows come first in a table."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Shown:
     """The output of a layout for some settings.
 
     Args:
-        lines: for the table of all experiments.
-        text: Markdown below it.
-        entries: rows of a table above the text, with lines of their own.
-        figures: by file name.
+        lines: lines in the table of all experiments.
+        text: Markdown below that table.
+        entries: rows of a table above the text, with their own lines.
+        figures: figures by file name.
     """
 
     lines: Sequence[str] = ()
@@ -41,15 +41,15 @@ class Shown:
 
 @dataclass(frozen=True)
 class Paper:
-    """A table of the paper, as conf/paper/numbers.yaml has it.
+    """A table of the paper, from conf/paper/numbers.yaml.
 
-    title: the paper's title.
-    lines: first and last line in the paper's LaTeX source.
+    title: title of the table in the paper.
+    lines: first and last line in the LaTeX source of the paper.
     columns: titles of the columns.
-    rows: for each name a number for each column, None where the paper prints none.
+    rows: numbers in each named row, one per column, None where the paper prints none.
 
     Raises:
-        ValueError: a row without a number for each column.
+        ValueError: a row does not have one number per column.
     """
 
     title: str
@@ -86,7 +86,7 @@ def _histograms(settings: Sequence[Setting], paper: Paper | None) -> Shown:
 
 
 def _objects(settings: Sequence[Setting], paper: Paper | None) -> Shown:
-    """Set our scores next to the paper's Table 1: rows are objects, columns methods, ours and the paper's."""
+    """Show our scores next to the paper's Table 1: rows are objects, columns are methods, ours and the paper's."""
     lines, parts = [], []
     means = {"AP": MEAN, "accuracy": "mean accuracy"}
     for setting in settings:
@@ -97,7 +97,7 @@ def _objects(settings: Sequence[Setting], paper: Paper | None) -> Shown:
 
 
 def objects_table(setting: Setting, paper: Paper | None, mean: str = MEAN) -> str:
-    """Return the score of every object in points with 95 % intervals, with the paper's in further columns."""
+    """Return a table of the scores of all objects in points, with 95 % intervals and the paper's numbers."""
     columns = [] if paper is None else list(paper.columns)
     theirs = {} if paper is None else paper.rows
     head = ["", *(f"{called(m)}, ours" for m in setting.methods), *(f"{name}, the paper" for name in columns)]
@@ -110,7 +110,7 @@ def objects_table(setting: Setting, paper: Paper | None, mean: str = MEAN) -> st
 
 
 def _photographs(settings: Sequence[Setting], paper: Paper | None) -> Shown:
-    """Set our scores next to the paper's Table 2: rows are ways of training, columns numbers of photographs."""
+    """Show our scores next to the paper's Table 2: rows are ways of training, columns are numbers of photographs."""
     tables = [photographs_table(settings), *([] if paper is None else [paper.markdown()])]
     return Shown(photographs_summary(settings), "\n\n".join(tables))
 
@@ -118,7 +118,8 @@ def _photographs(settings: Sequence[Setting], paper: Paper | None) -> Shown:
 def asked(setting: Setting) -> tuple[float, str]:
     """Return how many photographs a setting asks for, as a number to sort by and in words.
 
-    Numbers and fractions are of the configuration; how many there were, where that is fewer, follows in brackets.
+    Numbers and fractions are those in the configuration; if there were fewer photographs, their number follows in
+    brackets.
     """
     real = setting.first.results["config"]["training"]["real"]
     trained = [run.results["real"].get("photographs", 0) for run in setting.group.runs]
@@ -132,7 +133,7 @@ def asked(setting: Setting) -> tuple[float, str]:
 
 
 def photographs_table(settings: Sequence[Setting]) -> str:
-    """Return the mean score of the biased objects in points, with 95 % intervals."""
+    """Return a table of the mean score of the biased objects in points, with 95 % intervals."""
     columns = [text for _, text in sorted({asked(setting) for setting in settings})]
     rows: dict[str, dict[str, str]] = {}
     for setting in sorted(settings, key=_rank):
@@ -148,17 +149,17 @@ def photographs_table(settings: Sequence[Setting]) -> str:
 
 
 def _rank(setting: Setting) -> tuple[int, int]:
-    """Sort settings of all methods first, so that methods are in one order."""
+    """Return a sort key that puts settings with all methods first, so that methods keep one order."""
     return list(WAYS).index(_mode(setting)), -len(setting.methods)
 
 
 def _mode(setting: Setting) -> str:
-    """``none`` also where no photograph trained."""
+    """Return the mode of training on photographs, ``none`` also if there were no photographs."""
     return setting.first.results["real"].get("mode", NONE)
 
 
 def photographs_summary(settings: Sequence[Setting]) -> list[str]:
-    """Return NSO's lead over NS and the score of photographs alone, for each setting."""
+    """Return the lead of NSO over NS and the score of photographs alone, for each setting."""
     lines = []
     for setting in sorted(settings, key=asked):
         known = "real_only" in setting.columns
@@ -181,18 +182,18 @@ def _seconds(settings: Sequence[Setting], paper: Paper | None) -> Shown:
 
 
 def _iteration(record: Mapping[str, Any]) -> float:
-    """Phases ``hypergradient_*`` are parts of ``hypergradient``."""
+    """Return the seconds of an iteration; phases ``hypergradient_*`` are excluded as parts of ``hypergradient``."""
     return sum(s for phase, s in record["seconds"].items() if not phase.startswith("hypergradient_"))
 
 
 def _field(run: Mapping[str, Any]) -> float:
-    """Seconds of one object's field on average, where the store had it those that it took when it was fitted."""
+    """Return the mean seconds per field; a field found in the store counts with the time that its fit took."""
     stored = [o["seconds"] for o in run["left_out"] if o["stage"] == "field" and o["seconds"] is not None]
     return (run["seconds"]["field"] + sum(stored)) / len(run["psi"])
 
 
 def _range(values: Sequence[float]) -> str:
-    """Write the median, and the range if there is one: first iterations take two trainings more than last ones."""
+    """Write the median, and the range if values differ: first iterations run two more trainings than the last."""
     low, middle, high = (f"{value:.1f}" for value in (min(values), median(values), max(values)))
     return low if low == high else f"{middle} ({low} to {high})"
 

@@ -1,4 +1,4 @@
-"""Each biased object's score over starts (the paper's Fig. 5) or over targets (Fig. 6): figure and table rows."""
+"""Figure and table rows of the scores of biased objects over starts (the paper's Fig. 5) or targets (Fig. 6)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STARTS = {"same": "the target's", "uniform": "uniform", "disjoint": "disjoint"}
 COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
 """The starts in the paper's Fig. 5."""
 APART = 0.03
-"""Distance between methods, in distances between ticks."""
+"""Horizontal offset between methods, as a fraction of the distance between ticks."""
 LABELS = {"gap": "initial distribution", "target": "bins of the target"}
 
 
@@ -29,7 +29,7 @@ def short(name: str) -> str:
 
 
 def place(setting: Setting, name: str, axis: Axis) -> str:
-    """Return where a setting of an object stands on the axis."""
+    """Return the label of a setting of an object on the axis."""
     if axis == "gap":
         return STARTS[setting.gap]
     return "; ".join(modes(setting.distribution("target", name, f)) for f in setting.factors(name))
@@ -62,7 +62,7 @@ def _rank(key: tuple[str, str, str], settings: Sequence[Setting]) -> tuple[int, 
 
 
 def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
-    """Draw a panel an object, a line a method with 95 % intervals; matched, the upper bound, is dashed."""
+    """Draw one panel per object and one line per method, with 95 % intervals; matched, the upper bound, is dashed."""
     panels = _panels(settings, axis)
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
@@ -89,9 +89,9 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
 
 
 def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: float) -> Any:
-    """Draw one method's line, shifted from the ticks by ``aside`` so that intervals do not hide each other.
+    """Draw the line of one method, shifted from the ticks by ``aside`` so that intervals do not hide each other.
 
-    Settings without a run of it are gaps. Matched has a dash at every setting, so that a single one is visible too.
+    Settings without a run of the method are gaps. Matched has a dash at every setting, so that a single one is visible.
     """
     found = [setting.score(method, name) if method in setting.table.detectors else None for setting in panel]
     values = 100 * np.asarray([np.nan if each is None else each.value for each in found])
@@ -109,9 +109,9 @@ def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: fl
 
 
 def levels_entries(settings: Sequence[Setting], axis: Axis) -> list[Entry]:
-    """Return the score of every object at every setting, a column a method, in points with 95 % intervals.
+    """Return the score of every object at every setting, one column per method, in points with 95 % intervals.
 
-    Lines have NSO's score and its lead; over ``gap`` those of the disjoint start alone.
+    Lines give the score of NSO and its lead; over ``gap``, only for the disjoint start.
     """
     made = []
     for (experiment, start, name), panel in _panels(settings, axis).items():

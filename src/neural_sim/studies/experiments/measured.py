@@ -1,4 +1,4 @@
-"""What a page says about measured experiments, kept in a file next to it: runs of several machines fill one page."""
+"""Results shown on a page, kept in a file next to it, so that runs from several machines can fill one page."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from neural_sim.report.identity import at_scale
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of a table of settings, with the commit of its own runs.
+    """A row in a table of settings, with the commits of its own runs.
 
     Args:
-        place: what it is about, and its place in the table: the experiment, then what sorts within it.
+        place: identity and sort key of the row: the experiment, then keys within it.
         cells: text by column.
         line: a line for the table of all experiments; empty: none.
-        commits: commits of its runs' code.
+        commits: code commits of its runs.
     """
 
     place: tuple[str | int, ...]
@@ -33,14 +33,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Measured:
-    """What is known about one experiment.
+    """The results of one experiment.
 
     Args:
-        lines: lines for the page's table.
-        text: Markdown below it.
-        commits: commits of the runs' code.
-        entries: rows of a table above the text, with lines and commits of their own.
-        costs: Markdown below the text about the methods' costs.
+        lines: lines in the table of the page.
+        text: Markdown below that table.
+        commits: code commits of the runs.
+        entries: rows of a table above the text, with their own lines and commits.
+        costs: Markdown below the text, on the costs of the methods.
     """
 
     lines: Sequence[str]
@@ -56,28 +56,28 @@ class Measured:
 
     @property
     def all_commits(self) -> list[str]:
-        """Commits of the runs and of the entries' runs."""
+        """Code commits of all runs, including those of the entries."""
         return sorted({*self.commits, *(commit for entry in self.entries for commit in entry.commits)})
 
     @property
     def cell(self) -> str:
-        """The cell in the page's table."""
+        """The cell in the table of the page."""
         return "<br>".join([*self.summary, f"(commit {', '.join(self.all_commits)})"])
 
     @property
     def below(self) -> str:
-        """The text below the page's table."""
+        """The text below the table of the page."""
         parts = (table(self.entries) if self.entries else "", self.text, self.costs)
         return "\n\n".join(part for part in parts if part)
 
     def with_kept(self, kept: Measured | None, experiments: Sequence[str]) -> Measured:
-        """Add the entries of ``kept`` for places that have none here, in the order of ``experiments``."""
+        """Return these results with the entries of ``kept`` for places without one here, ordered by ``experiments``."""
         old = () if kept is None else kept.entries
         return dataclasses.replace(self, entries=merged(old, self.entries, experiments))
 
 
 def merged(kept: Sequence[Entry], new: Sequence[Entry], experiments: Sequence[str]) -> tuple[Entry, ...]:
-    """Return the entries of ``experiments`` in their order; ``new`` ones replace ``kept`` ones of the same place."""
+    """Return the entries of ``experiments``, in that order; ``new`` ones replace ``kept`` ones at the same place."""
     by_place = {entry.place: entry for entry in (*kept, *new)}
     known = [entry for entry in by_place.values() if entry.place[0] in experiments]
     return tuple(sorted(known, key=lambda entry: (experiments.index(str(entry.place[0])), *entry.place[1:])))
@@ -86,7 +86,7 @@ def merged(kept: Sequence[Entry], new: Sequence[Entry], experiments: Sequence[st
 def table(entries: Sequence[Entry]) -> str:
     """Return a Markdown table with the columns of all entries; cells that an entry lacks are empty.
 
-    Columns are in the order of the entry that has most.
+    Columns are ordered as in the entry with the most columns.
     """
     most = max((entry.cells for entry in entries), key=len)
     columns = list(dict.fromkeys([*most, *(column for entry in entries for column in entry.cells)]))
@@ -94,12 +94,12 @@ def table(entries: Sequence[Entry]) -> str:
 
 
 def document_of(page: str) -> Path:
-    """Return the file that keeps the measured rows of a page."""
+    """Return the file that keeps the results shown on a page."""
     return Path(page).with_suffix(".json")
 
 
 def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
-    """Read the rows by name; empty if there is no such file, or if it is for another ``budget`` (the scale)."""
+    """Read results by row name; empty if the file does not exist or is for another ``budget`` (scale)."""
     if not file.is_file():
         return {}
     document = json.loads(file.read_text(encoding="utf-8"))
@@ -108,20 +108,20 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
 
 
 def _row(entries: Sequence[Mapping[str, Any]] = (), **row: Any) -> Measured:
-    """Older files have no entries and no costs."""
+    """Read one row; files of older versions have no entries and no costs."""
     read = tuple(Entry(**{**entry, "place": tuple(entry["place"])}) for entry in entries)
     return Measured(**row, entries=read)
 
 
 def write_measured(file: Path, budget: Mapping[str, Any], rows: Mapping[str, Measured]) -> None:
-    """Write what ``read_measured`` reads."""
+    """Write results for ``read_measured``."""
     write_json(
         file, {"budget": budget, "rows": {name: dataclasses.asdict(row) for name, row in rows.items()}}
     )
 
 
 def newest_document(uri: str, experiment: str, name: str, budget: Mapping[str, Any]) -> Measured | None:
-    """Read the Markdown file ``name`` of an experiment's newest finished run at the scale ``budget``; None without."""
+    """Read the Markdown file ``name`` of an experiment's newest finished run at this ``budget``; None without one."""
     if experiment not in tracking.experiments(uri):
         return None
     for run in tracking.logged_runs(uri, experiment):

@@ -1,4 +1,4 @@
-"""Settings of an experiment that were run: for each, its runs and its scores, of the newest way of scoring."""
+"""The settings of an experiment that were run, each with its runs and scores, by the newest way of scoring."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ AXES = re.compile(r"parameter\.\w+\.(gap|biased)\b|training\.real\.(mode|count|f
 """Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects, and how
 many photographs train, and how."""
 MEAN = "mAP"
-"""The name of the mean over the biased objects among them."""
+"""Name under which the mean over biased objects is listed with the objects."""
 CALLED = {"ns": "NS", "matched": "matched", "neural_sim": "NSO", "auto_sim": "Auto-Sim", "lts": "LTS"}
 
 
@@ -31,7 +31,7 @@ def called(method: str) -> str:
 
 @dataclass(frozen=True)
 class Setting:
-    """One start and target of an experiment: its runs of all methods and seeds, and what they score.
+    """One start and target of an experiment, with the runs of all methods and seeds and their scores.
 
     Args:
         group: the runs.
@@ -45,12 +45,12 @@ class Setting:
 
     @staticmethod
     def of(group: Group, reference: str, draws: int, seed: int = 0) -> Setting:
-        """Score the runs of a group; ``draws`` and ``seed`` are of the bootstrap."""
+        """Score the runs of a group; ``draws`` and ``seed`` are those of the bootstrap."""
         return Setting(group, reference, score_table(group.runs, reference, draws, seed))
 
     @property
     def first(self) -> FinishedRun:
-        """A run, for what all have in common."""
+        """One of the runs, to read what all have in common."""
         return self.group.runs[0]
 
     @property
@@ -75,39 +75,39 @@ class Setting:
 
     @cached_property
     def methods(self) -> list[str]:
-        """The detectors, from ns to matched, the upper bound; the reference is the last that learns."""
+        """The detectors in order, from ns to matched, the upper bound; the reference is the last that learns."""
         learned = [name for name in self.table.detectors if name not in (*BOUNDS, *WITHOUT, self.reference)]
         order = ["ns", *sorted(learned, reverse=True), self.reference, "matched"]
         return [name for name in order if name in self.table.detectors]
 
     @property
     def columns(self) -> list[str]:
-        """The detectors, and where photographs train those without synthetic images or without photographs."""
+        """The detectors, including, if photographs train, those without synthetic images or without photographs."""
         return [*self.methods, *(name for name in WITHOUT if name in self.table.detectors)]
 
     @property
     def commits(self) -> list[str]:
-        """The commits of the code of its runs."""
+        """Code commits of the runs."""
         return sorted({run.results.get("commit") or UNKNOWN for run in self.group.runs})
 
     @property
     def of_reference(self) -> list[Mapping[str, Any]]:
-        """results.json of the reference method's runs, a seed each."""
+        """results.json of each run of the reference method, one per seed."""
         return [run.results for run in self.group.runs if run.method == self.reference]
 
     def score(self, method: str, name: str = MEAN) -> Estimate:
-        """Return a detector's score of an object, or the mean over objects."""
+        """Return the score of a detector on an object, or its mean over objects."""
         return self._of(name).mean(method)
 
     def ahead(self, method: str, name: str = MEAN) -> Estimate:
-        """Return the reference's score minus a method's."""
+        """Return the score of the reference minus that of a method."""
         return self._of(name).ahead(self.reference, method)
 
     def _of(self, name: str) -> ScoreTable:
         return self.table if name == MEAN else self.table.of_classes([name])
 
     def verdict(self, name: str = MEAN) -> str:
-        """Say what the reference scores, and by how much it is ahead of each method."""
+        """Give the score of the reference and its lead over each method, in words."""
         ours = points(self.score(self.reference, name))
         others = [method for method in self.methods if method not in (self.reference, "matched")]
         ahead = [f"{called(method)} by {points(self.ahead(method, name))}" for method in others]
@@ -118,7 +118,7 @@ class Setting:
         return self.first.results["psi"][name][factor][which]
 
     def factors(self, name: str) -> list[str]:
-        """Return what is learned of an object."""
+        """Return the factors that are learned for an object."""
         return list(self.first.results["psi"][name])
 
 
@@ -127,11 +127,11 @@ class Settings:
     """Read the settings of experiments from MLflow.
 
     Args:
-        uri: of the MLflow store.
-        budget: the ``budget`` of the configuration that runs must have: the scale.
+        uri: address of the MLflow store.
+        budget: ``budget`` (scale) that runs must have in their configuration.
         reference: the method that the others are compared with.
-        draws: of the bootstrap.
-        seed: of the bootstrap.
+        draws: number of bootstrap draws.
+        seed: seed of the bootstrap.
     """
 
     uri: str
@@ -141,9 +141,9 @@ class Settings:
     seed: int
 
     def read(self, experiments: Sequence[str]) -> tuple[list[Setting], list[LeftOut]]:
-        """Return the settings of experiments in their order, those of each as they were run first, and runs left out.
+        """Return the settings of experiments, and the runs that are left out.
 
-        An experiment without runs has no settings.
+        Settings are ordered by experiment, then by first run. An experiment without runs has none.
         """
         known = tracking.experiments(self.uri)
         groups, left_out = self.groups(Runs.read(self.uri, [name for name in experiments if name in known]))
@@ -151,7 +151,7 @@ class Settings:
         return [Setting.of(group, self.reference, self.draws, self.seed) for group in groups], left_out
 
     def groups(self, runs: Runs) -> tuple[list[Group], list[LeftOut]]:
-        """Return groups of runs to compare; of an experiment that was scored in several ways, those of the newest."""
+        """Return groups of runs to compare; if an experiment was scored in several ways, those of the newest way."""
         right = runs.without(lambda run: None if self._at_scale(run) else "it was run at another scale")
         found, left_out = select(right, self.reference)
         newest: dict[str, str] = {}
@@ -165,17 +165,17 @@ class Settings:
 
     def _at_scale(self, run: FinishedRun) -> bool:
         if run.unusable is not None:
-            return True  # left out for that
+            return True  # such runs are left out for another reason
         return at_scale(run.results.get("config", {}).get("budget") or {}, self.budget)
 
 
 def _way(run: FinishedRun) -> str:
-    """Return a digest of all that scores depend on but what an experiment varies."""
+    """Return a digest of everything that scores depend on, except what an experiment varies."""
     values = scored_values(run.results)
     return digest({key: value for key, value in values.items() if not AXES.match(key)})
 
 
 def modes(p: Sequence[float]) -> str:
-    """Write a distribution in short: its bins, from 1, that have more than an equal part, or ``uniform``."""
+    """Abbreviate a distribution: the bins, from 1, with more than an equal share, or ``uniform``."""
     more = [str(bin) for bin, value in enumerate(p, 1) if value * len(p) > 1.05]
     return ", ".join(more) or "uniform"

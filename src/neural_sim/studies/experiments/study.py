@@ -1,4 +1,4 @@
-"""The page of all experiments: for each its command, what its finished runs gave, and what the paper has."""
+"""The page of all experiments, with the command, the results of finished runs and the paper's numbers for each."""
 
 from __future__ import annotations
 
@@ -36,23 +36,24 @@ COMMAND = "python -m src.main +experiment=experiments_table experiments.page=doc
 
 @dataclass(frozen=True)
 class Row:
-    """One experiment of the page.
+    """One experiment on the page.
 
     Args:
-        title: what the paper calls it, and where.
+        title: the paper's name for it, and the section.
         experiment: the file in conf/experiment; a row without its file is left out.
         runs: the MLflow experiments of its runs.
-        layout: how they are shown, one of ``LAYOUTS``; null: by the runs' own ``document``.
-        document: a Markdown file that a run leaves, of which the newest is shown; null: its figures alone say it.
-        command: what runs it; null: ``python -m src.main +experiment=<experiment>``.
+        layout: how the runs are shown, one of ``LAYOUTS``; null: by the ``document`` that they wrote.
+        document: a Markdown file written by runs, of which the newest is shown; null: there are only figures.
+        command: command that runs it; null: ``python -m src.main +experiment=<experiment>``.
         claims: entries of the paper's ``claims``.
-        table: the paper's table that stands beside ours.
-        differs: what differs from the paper's setting.
-        needs: data that the project does not bring; the page says so of a row without runs.
-        elsewhere: where the documentation's page sends a reader instead of having our numbers; empty: it has them.
+        table: the paper's table to show next to ours.
+        differs: differences from the paper's setting.
+        needs: data that the project does not ship, which the page mentions if there are no runs.
+        elsewhere: place that the page of the documentation refers to instead of giving our numbers; empty: it gives
+            them.
 
     Raises:
-        ValueError: an unknown layout, one without runs, or a document besides.
+        ValueError: the layout is unknown, has no runs, or is given together with a document.
     """
 
     title: str
@@ -76,19 +77,19 @@ class Row:
 
     @property
     def exists(self) -> bool:
-        """Whether conf/experiment has its file."""
+        """Whether its file exists in conf/experiment."""
         return (conf_directory() / "experiment" / f"{self.experiment}.yaml").is_file()
 
     @property
     def without_runs(self) -> str:
-        """What the page says in the place of our numbers."""
+        """Text in place of our numbers if there are no runs."""
         if not self.runs and not self.document:
             return BY_FIGURES
         return f"{NOT_YET}, needs {self.needs}" if self.needs else NOT_YET
 
     @property
     def command_line(self) -> str:
-        """What runs it."""
+        """The command that runs the experiment."""
         return self.command or f"python -m src.main +experiment={self.experiment}"
 
 
@@ -98,15 +99,15 @@ class Experiments(Task):
     """Write the page of experiments; ``+experiment=experiments_table``.
 
     Args:
-        rows: the constructor arguments of each ``Row``, by a name of its own.
+        rows: constructor arguments of each ``Row``, by row name.
         paper: ``claims`` and ``tables`` of conf/paper/numbers.yaml.
-        only: names of the rows to read runs of; null: all.
-        page: where the page goes besides the run's folder, with all rows; null: nowhere.
+        only: names of the rows whose runs are read; null: all.
+        page: a second place to write the page to, with all rows; null: none.
         reference: the method that the others are compared with.
-        draws: of the bootstrap over test images.
+        draws: bootstrap draws over test images.
 
     Raises:
-        ValueError: an unknown row, claim or table.
+        ValueError: a row, claim or table is unknown.
     """
 
     rows: Mapping[str, Mapping[str, Any]]
@@ -137,15 +138,15 @@ class Experiments(Task):
         print(f"results: {context.folder}")
 
     def write(self, uri: str, config: Mapping[str, Any], folder: Path) -> str:
-        """Write experiments.md, experiments.json and figures, and the page where it is asked for.
+        """Write experiments.md, experiments.json and figures, and the page if asked for.
 
-        The page is short: what settings and objects gave, and costs, are in the JSON file of the same name. A page
-        keeps what it said of experiments, and of settings in a table of settings, without runs here, from that file.
+        The page is short: results by setting and object, and costs, are in the JSON file of the same name. Experiments
+        and settings without runs here keep their previous results, which are read from that file.
 
         Args:
-            uri: of the MLflow store.
-            config: only runs with its ``budget`` count; its ``seed`` is of the bootstrap.
-            folder: where the files go.
+            uri: address of the MLflow store.
+            config: configuration; only runs with its ``budget`` count, and its ``seed`` seeds the bootstrap.
+            folder: output folder.
 
         Returns:
             The text of experiments.md.
@@ -181,7 +182,7 @@ class Experiments(Task):
     def _found(
         self, row: Row, settings: Settings
     ) -> tuple[Measured | None, Mapping[str, Any], list[LeftOut]]:
-        """Return what its finished runs gave, None without such; their figures by name, and runs that do not count."""
+        """Return the results of finished runs (None without any), their figures by name, and runs that do not count."""
         if row.document is not None:
             return newest_document(settings.uri, row.experiment, row.document, settings.budget), {}, []
         if row.layout is None:
@@ -209,7 +210,7 @@ class Experiments(Task):
         return ["# Experiments", written, note]
 
     def _brief(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
-        """Return a section for each row: its command, what the paper says, what we have, and what differs."""
+        """Return one section per row with its command, the paper's numbers, ours, and the differences."""
         parts = [*self._head(budget), IN_JSON]
         for name, row in rows.items():
             own = made.get(name)
@@ -245,7 +246,7 @@ class Experiments(Task):
         ]
         for name, row in rows.items():
             below = [made[name].below] if name in made and made[name].below else []
-            # A layout sets the paper's table next to ours.
+            # Layouts show the paper's table next to ours themselves.
             if row.table and not (below and row.layout):
                 below.append(self._tables[row.table].markdown())
             if below:
@@ -258,7 +259,7 @@ class Experiments(Task):
         return "\n\n".join(parts) + "\n"
 
     def _claims(self, row: Row) -> list[str]:
-        """Return what the paper says, with its source."""
+        """Return the paper's claims with their sources."""
         found = [claim for name in row.claims for claim in self.paper["claims"][name]]
         sources: dict[str, list[str]] = {}
         for claim in found:
@@ -271,14 +272,14 @@ class Experiments(Task):
 
 
 def _point(title: str, lines: Sequence[str]) -> str:
-    """Write one point of a list; several lines are points below it."""
+    """Format one item of a list; several lines become nested items."""
     if len(lines) == 1:
         return f"- **{title}**: {lines[0]}"
     return "\n".join([f"- **{title}**:", *(f"    - {line}" for line in lines)])
 
 
 def _to_first_table(text: str) -> str:
-    """Return the paragraphs of a document up to its first table, all where it has none."""
+    """Return the paragraphs of a document up to its first table, or all if it has none."""
     parts = text.split("\n\n")
     first = next((number for number, part in enumerate(parts) if part.startswith("|")), len(parts))
     return "\n\n".join(parts[: first + 1])
