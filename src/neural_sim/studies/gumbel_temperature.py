@@ -1,4 +1,4 @@
-"""The Gumbel-softmax temperature: where relaxed draws lie, bias and spread of the pathwise derivative (Sec. A.3)."""
+"""Effect of the Gumbel-softmax temperature on relaxed draws and on the pathwise derivative (Sec. A.3)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from neural_sim.tasks.context import Context, Task
 
 BIAS, SPREAD = METHOD_COLOURS["learned"], "#e08a1e"
 LEAST = 1e-2
-"""Lower limit of the figure, in lengths of the derivative."""
+"""Lower limit of the figure, as a multiple of the norm of the derivative."""
 
 
 @dataclass(frozen=True)

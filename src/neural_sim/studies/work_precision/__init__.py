@@ -1,1 +1,1 @@
-"""Error against run time wherever a default is decided, one family of measurements a file."""
+"""Error against run time for every choice that sets a default; each file is one family of measurements."""

@@ -1,7 +1,7 @@
-"""The derivative of an image by the numbers of its scene parameters: forward, reverse, by patches, by differences.
+"""The derivative of an image by its scene parameters: forward mode, reverse mode (also by patches), differences.
 
-Each way ends with the m numbers d<cotangent, image>/dV for a given cotangent, nonzero in every pixel. Reverse renders
-twice and goes back once (the paper's Tool 3), forward renders once.
+Every way computes the m numbers d<cotangent, image>/dV for a given cotangent that is nonzero in every pixel. Reverse
+mode takes two renders and one backward pass (the paper's Tool 3), forward mode takes one render.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from neural_sim.synthesis.motion import RIGID, pose_rates
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 MOST = 12
-"""Entries of a pose, by which its rates differ."""
+"""Number of entries of a pose that can change."""
 Way = Callable[["Case"], Float[Tensor, "m"]]
 
 
@@ -51,9 +51,9 @@ class Case:
         return replace(self, field=field, pose=self.pose.double(), rates=self.rates.double(), cotangent=maps)
 
     def rays(self, moved: Float[Tensor, "m"], pixels: Tensor) -> Rays:
-        """Return rays of ``pixels`` where the camera has moved by these numbers.
+        """Return the rays of ``pixels`` after the camera moved by these amounts.
 
-        Most of the moved matrices are no rotations; directions stay of unit length.
+        Most of the moved matrices are not rotations; directions are kept at unit length.
         """
         pose = self.pose + torch.einsum("m,mnij->nij", moved, self.rates)
         rays = cameras.pixel_rays(self.camera, pose, pixels)
@@ -61,7 +61,7 @@ class Case:
 
 
 def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) -> Case:
-    """Make an image by phi, rho and distance, then by random directions of the pose's twelve entries."""
+    """Make a case whose directions are phi, rho and distance, then random ones in the twelve entries of the pose."""
     generator, device = torch.Generator().manual_seed(0), next(field.parameters()).device
     camera = PinholeCamera(size, size, math.radians(40.0))
     draw = SceneDraw(*(torch.tensor([x]) for x in (1.1, 0.4, 3.0)), bins=torch.zeros(1, 1, dtype=torch.long))
@@ -75,7 +75,7 @@ def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) 
 
 
 def forward(of: Case) -> Float[Tensor, "m"]:
-    """Differentiate by forward mode, in the pass that renders."""
+    """Differentiate in forward mode, in the same pass as the render."""
     moved = of.renderer.render_with_tangents(of.field, of.camera, of.pose, of.rates)[1]
     return torch.cat(
         list(contract({str(i): tangent for i, tangent in enumerate(moved)}, of.cotangent).values())
@@ -83,9 +83,9 @@ def forward(of: Case) -> Float[Tensor, "m"]:
 
 
 def reverse(of: Case, patch: int) -> Float[Tensor, "m"]:
-    """Differentiate by reverse mode, ``patch`` rays at a time, after a pass that renders.
+    """Differentiate in reverse mode, ``patch`` rays at a time, after a render.
 
-    As ``gradient.pathwise.draw_cotangents``, for a camera that moves linearly in any number of numbers.
+    Works like ``gradient.pathwise.draw_cotangents``, for a camera that moves linearly in any number of directions.
     """
     of.renderer.render(of.field, of.camera, of.pose)
     rgb, opacity = of.cotangent.rgb.reshape(-1, 3), of.cotangent.opacity.reshape(-1)
@@ -102,10 +102,10 @@ def reverse(of: Case, patch: int) -> Float[Tensor, "m"]:
 
 @torch.no_grad()
 def difference(of: Case, step: float, same: bool) -> Float[Tensor, "m"]:
-    """Differentiate by central differences of renders of all rays, two for each number.
+    """Differentiate by central differences of full renders, two per direction.
 
-    ``same``: at the samples of the unmoved camera, as the derivatives have it. Otherwise each render chooses its own,
-    so that samples behind the termination come and go, in jumps that no small step removes.
+    With ``same``, renders use the samples of the unmoved camera, as the derivatives do. Otherwise each render chooses
+    its own samples, so that samples near the termination appear and vanish in jumps that no small step removes.
     """
     field = of.field.with_step(of.renderer.step)
     pixels = torch.arange(of.camera.width * of.camera.height, device=of.pose.device)
@@ -131,9 +131,9 @@ class Derivative:
 
     Args:
         size: pixels a side.
-        numbers: m, by how many numbers of its camera an image is differentiated; a series each.
-        patches: rays of a patch of the reverse mode.
-        steps: of the central differences, in radians and object radii.
+        numbers: numbers m of camera parameters to differentiate by; one series each.
+        patches: patch sizes in rays, for reverse mode.
+        steps: steps of the central differences, in radians and object radii.
     """
 
     size: PositiveInt = 64
@@ -142,7 +142,7 @@ class Derivative:
     steps: tuple[Positive, ...] = (1e-2, 1e-4, 1e-6)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Measure errors relative to the norm of the whole image's reverse mode in float64, of the first object."""
+        """Measure errors for the first object, relative to reverse mode on the whole image in float64."""
         del seed  # the camera and the cotangent are the same for all seeds
         for count in self.numbers:
             of = case(world.fields[0], world.renderer, self.size, count)
@@ -167,7 +167,7 @@ class Derivative:
             )
 
     def ways(self, of: Case, precise: Case) -> Iterator[tuple[str, str, Case, Way]]:
-        """Yield setting, line, the problem in its type, and how it is differentiated."""
+        """Yield setting, line, the case in its precision, and the function that differentiates it."""
         yield "forward", "forward", of, forward
         chunks = replace(of, renderer=NerfRenderer(of.renderer.quality, rays_per_chunk=512))
         yield "forward, chunks of 512 rays", "forward", chunks, forward

@@ -33,7 +33,7 @@ Estimates = Float[Tensor, "repeats objects k"]
 
 @dataclass(frozen=True)
 class Variant:
-    """A pathwise estimator with the settings of other packages that belong to it."""
+    """A pathwise estimator, with the matching settings of other packages."""
 
     estimator: PathwiseEstimator
     bin_mean: str = "circular"
@@ -52,7 +52,7 @@ PATHWISE = {
 
 @dataclass
 class Result:
-    """One estimator: estimates, and processor or wall seconds an object, by number of images."""
+    """Results of one estimator: estimates, and seconds per object, by number of images."""
 
     estimates: dict[int, Estimates] = field(default_factory=dict)
     seconds: dict[int, float] = field(default_factory=dict)
@@ -64,14 +64,14 @@ class Estimators:
     """The family ``estimator``.
 
     Args:
-        images: numbers N of an estimate, growing, each a multiple of the first.
-        default: images of the project's own, the stratified one: 24 probes of each of 8 bins.
-        repeats: estimates from the largest N; there are more from fewer.
-        truth_per_bin: images of every bin for the reference.
-        pathwise: variants of the pathwise estimator, of ``PATHWISE``.
+        images: numbers N of images per estimate, increasing, each a multiple of the first.
+        default: number of images of the default, the stratified estimator: 24 probes in each of 8 bins.
+        repeats: number of estimates from the largest N; there are more from smaller N.
+        truth_per_bin: images per bin for the reference.
+        pathwise: variants of the pathwise estimator, from ``PATHWISE``.
 
     Raises:
-        ValueError: an unknown variant, or numbers of images that are no multiples of the first.
+        ValueError: a variant is unknown, or a number of images is not a multiple of the first.
     """
 
     images: Annotated[tuple[PositiveInt, ...], MinLen(1), Ascending()] = (16, 32, 64, 128)
@@ -92,7 +92,7 @@ class Estimators:
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Measure at the initial psi of the run's loop and its solver's v; means over repeats and objects."""
+        """Measure at the initial psi of the run, with v from its solver; means over repeats and objects."""
         loop = world.loop
         random = torch.Generator().manual_seed(1_000 * seed + 21)
         hard = loop.truth(self.truth_per_bin, random)
@@ -126,12 +126,12 @@ class Estimators:
         return f"± {float(errors.var(0).mean().sqrt()):.2g} over {len(errors)} repeats"
 
     def _pathwise(self, loop: FrozenLoop, name: str, timing: Timing, seed: int) -> Result:
-        """Estimate by equal seeds, so that variants that draw alike see the same images.
+        """Estimate with equal seeds, so that variants with the same draws see the same images.
 
-        Images are independent, so that estimates from more of them are means of those from the fewest.
+        Images are independent, so that estimates from more images are means of estimates from the smallest number.
         """
         variant, unit = PATHWISE[name], self.images[0]
-        # Reverse mode's numbers are those of the row "linear", but for rounding: one repeat shows its seconds.
+        # Reverse mode gives the numbers of the row "linear" up to rounding, so one repeat is enough for its time.
         repeats = 1 if variant.estimator.mode == "reverse" else self.repeats
         moved, generator, units = variant.of(loop), torch.Generator().manual_seed(seed + 100), []
         begun = timing.now()
@@ -146,7 +146,7 @@ class Estimators:
         return result
 
     def _stratified(self, loop: FrozenLoop, timing: Timing, seed: int) -> dict[str, Result]:
-        """Estimate from disjoint parts of a pool of every bin; as it is, and shrunk as the psi update does it."""
+        """Estimate from disjoint subsets of a pool of every bin, as is and with the shrinkage of the psi update."""
         bins = loop.scene.distribution.size
         counts = sorted({*self.images, self.default})
         pool = self.repeats * max(2, counts[-1] // bins)
@@ -156,7 +156,7 @@ class Estimators:
         probes, plain, shrunk = [part[loop.factor.name] for part in probed.probes], Result(), Result()
         for count in counts:
             per_bin, values, kept = count // bins, [], []
-            if per_bin < 2:  # whose noise is unknown
+            if per_bin < 2:  # the noise of a single image is unknown
                 continue
             begun = timing.now()
             for first in range(0, pool - per_bin + 1, per_bin):
@@ -176,7 +176,7 @@ class Estimators:
         return {"stratified": plain, "stratified, shrunk": shrunk}
 
     def _reinforce(self, loop: FrozenLoop, timing: Timing, seed: int) -> Result:
-        """Estimate from disjoint parts of hard draws of every object."""
+        """Estimate from disjoint subsets of hard draws of every object."""
         pool = self.repeats * self.images[-1]
         begun = timing.now()
         rendered = loop.scene.training_set(loop.psi, pool, torch.Generator().manual_seed(seed + 41))
@@ -200,7 +200,7 @@ class Estimators:
 def score(
     loop: FrozenLoop, estimator: Estimator, cached: CachedSet, drawn: Probes, label: int
 ) -> MixedDerivative:
-    """Estimate from the scores of some of the cached images, whose pixels it does not need."""
+    """Estimate from the scores of some of the cached images; their pixels are not needed."""
     count = len(drawn.index)
     still = torch.zeros(count)
     images = ObjectImages(
@@ -216,7 +216,7 @@ def _unavailable(*_: object) -> Tensor:
 
 
 def cosine(a: Tensor, b: Tensor) -> Tensor:
-    """Return the cosine along the last axis; 0 where an estimate is nothing at all."""
+    """Return the cosine along the last axis; 0 where an estimate is zero."""
     return torch.nn.functional.cosine_similarity(a, b, dim=-1, eps=1e-30)
 
 
@@ -226,7 +226,7 @@ def relative_error(a: Tensor, b: Tensor) -> Tensor:
 
 
 def ceilings(value: Float[Tensor, "objects k"], standard_error: Float[Tensor, "objects k"]) -> list[float]:
-    """Return the cosine that the exact vector would be expected to have with each estimate of it."""
+    """Return the expected cosine between the exact vector and each estimate of it."""
     noise = standard_error.square().sum(-1)
     signal = (value.square().sum(-1) - noise).clamp_min(0.0)
     return (signal / (signal + noise).clamp_min(1e-30)).sqrt().tolist()

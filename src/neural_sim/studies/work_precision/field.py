@@ -1,4 +1,4 @@
-"""Held-out error of fitted fields against the seconds of their fits, by steps."""
+"""Held-out error of fields against fitting time, for several numbers of steps."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.world import World
 
 SCHEDULES = ("refine_steps", "prune_steps")
-"""Arguments of a fitting that are steps of it, and move with their number."""
+"""Arguments of a fitting that are step numbers, and scale with the number of steps."""
 
 
 def scaled(recipe: FieldRecipe, part: float) -> FieldRecipe:
-    """Return the recipe with ``part`` times its steps, those at which its structure changes in proportion."""
+    """Return the recipe with ``part`` times its steps, and the steps at which its structure changes in proportion."""
     fitting = recipe.fitting
     if isinstance(fitting, functools.partial):
         moved = {
@@ -34,12 +34,12 @@ class Fields:
     """The family ``field``.
 
     Args:
-        recipes: how the fields are fitted, by name.
-        parts: numbers of steps, by the same names, in those of the recipe.
-        default: the project's own among ``recipes``, at all of its steps.
+        recipes: recipes of fields, by name.
+        parts: numbers of steps by the same names, as multiples of the recipe's.
+        default: the default among ``recipes``, with all of its steps.
 
     Raises:
-        ValueError: names that differ, or no such default.
+        ValueError: the names differ, or the default is not among them.
     """
 
     recipes: Mapping[str, FieldRecipe] = field(default_factory=dict)
@@ -54,8 +54,8 @@ class Fields:
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Fit the run's first object; seconds on the wall, of the training without the renders that score it."""
-        del timing, seed  # a fit notes its own time, and its recipe has its own seed
+        """Fit the first object of the run; wall-clock seconds of training, without the renders that score it."""
+        del timing, seed  # a fit records its own time, and its recipe has its own seed
         views, points = world.views, []
         for name, recipe in self.recipes.items():
             for part in self.parts[name]:

@@ -1,7 +1,7 @@
-"""The hypergradient of the training that was run, by each adjoint, against the response of training.
+"""The hypergradient of the training that was run, by each adjoint, compared with the response of training.
 
-The response (``outer.response``) repeats the training with part of an object's images moved to one bin, under common
-random numbers, and takes no derivative. Derivatives are compared with it as vectors over an object's bins.
+The response (``outer.response``) is a finite difference: it repeats the training with a fraction of an object's images
+moved to one bin, under common random numbers. Derivatives are compared with it as vectors over the bins of an object.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from neural_sim.studies.work_precision.world import World
 _log = logging.getLogger(__name__)
 Slopes = Float[Tensor, "objects K"]
 Place = Literal["start", "first_step", "end"]
-"""Of a psi loop: where it starts, where its first step that moved psi led, where it ends."""
+"""Places in a psi loop: the start, psi after the first step that moved it, and the end."""
 DEFAULT = "unrolled, as configured"
 EXACT = "unrolled, exact products, all probes every step"
 
 
 @dataclass(frozen=True)
 class Way:
-    """An adjoint: the loop's settings and the solver, and the line of the figure that it is on."""
+    """An adjoint, given by the settings of the loop and the solver, with its line in the figure."""
 
     line: str
     outer: Outer
@@ -48,7 +48,7 @@ class Way:
 
 
 def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
-    """Return every adjoint by name, as changes of the loop's own settings."""
+    """Return every adjoint by name, as a change of the configured settings."""
 
     def unrolled(line: str, **changed: object) -> Way:
         own = outer.adjoint if isinstance(outer.adjoint, Unrolled) else Unrolled()
@@ -81,9 +81,9 @@ class Hypergradients:
     """The family ``hypergradient``.
 
     Args:
-        trainings: seeds of the training whose derivative is taken.
-        solver: of the implicit ways, the project's own.
-        places: where on the loop's way; all but its start run the loop first.
+        trainings: number of trainings, with different seeds, whose derivatives are taken.
+        solver: the default solver, for implicit adjoints.
+        places: places in the psi loop; all except the start run the loop first.
     """
 
     trainings: PositiveInt = 2
@@ -91,8 +91,8 @@ class Hypergradients:
     places: Annotated[Sequence[Place], MinLen(1)] = ("start",)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Measure at every place that the loop has come to."""
-        del timing  # a hypergradient notes its own time
+        """Measure at every place that the loop reaches."""
+        del timing  # a hypergradient records its own time
         for place in self.places:
             psi = None if place == "start" else world.visited.get(place)
             if psi is None and place != "start":
@@ -113,7 +113,7 @@ class Hypergradients:
             truths.append(truth)
             found = {name: slopes(loop, way) for name, way in named.items()}
             for name, (value, seconds) in found.items():
-                # A correlation of 1 may be rounded beyond it.
+                # Rounding may push a correlation beyond 1.
                 responses[name].append((max(0.0, 1.0 - correlation(value, truth)), seconds))
                 if name in exact:
                     exact[name].append((relative_error(value, found[EXACT][0]), seconds))
@@ -137,7 +137,7 @@ class Hypergradients:
 def _points(
     found: Mapping[str, Sequence[tuple[float, float]]], named: Mapping[str, Way]
 ) -> tuple[Point, ...]:
-    """Return the mean error and seconds of every way."""
+    """Return the mean error and the mean seconds of every way."""
     return tuple(
         Point(name, fmean(error for error, _ in rows), fmean(spent for _, spent in rows), None, name == DEFAULT,
               named[name].line, _spread([error for error, _ in rows]))
@@ -146,9 +146,9 @@ def _points(
 
 
 def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
-    """Return the rise of objects' scores by the part of their images that moves to each bin; the derivative's seconds.
+    """Return slopes of the objects' scores by the fraction of images moved to each bin, and the time they took.
 
-    Images, training and probes are the same for all ways: the loop's common random numbers, and its generator anew.
+    Images, training and probes are the same for all ways: common random numbers, and a generator with the same seed.
     """
     generator = torch.Generator().manual_seed(loop.numbers.generator.initial_seed())
     inner = replace(loop.inner, settings=way.outer)
@@ -160,13 +160,13 @@ def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
 
 
 def relative_error(found: Slopes, truth: Slopes) -> float:
-    """Return |found - truth| / |truth| of slopes without their means over an object's bins."""
+    """Return |found - truth| / |truth| after subtracting the mean over each object's bins."""
     value, wanted = (each - each.mean(-1, keepdim=True) for each in (found, truth))
     return float((value - wanted).norm() / wanted.norm())
 
 
 def correlation(found: Slopes, truth: Slopes) -> float:
-    """Return the correlation over each object's bins, mean over objects; 0 for an object where either vanishes."""
+    """Return the correlation over bins, averaged over objects; 0 for an object whose slopes vanish in either."""
     each = [centred_cosine(a, b) for a, b in zip(found, truth, strict=True)]
     return fmean(0.0 if math.isnan(value) else value for value in each)
 

@@ -1,4 +1,4 @@
-"""Error of whole methods against the seconds that they took: this run's own, and finished runs from MLflow."""
+"""Error of whole methods against their run time, for this run's own method and finished runs in MLflow."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class Loops:
     """The family ``loop``.
 
     Args:
-        experiment: of the finished runs in MLflow.
-        reference: the method whose runs the others must be comparable with, and the project's own.
+        experiment: MLflow experiment of the finished runs.
+        reference: the default method, whose runs the others must be comparable with.
     """
 
     experiment: str = "pose_gap"
     reference: str = "neural_sim"
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Read this run's own method on its objects, and every group of comparable finished runs."""
+        """Measure this run's own method, and read every group of comparable finished runs."""
         del seed
         groups = []
         if self.experiment in tracking.experiments(world.uri):
@@ -53,7 +53,9 @@ def series(
     seeds = sorted({run["seed"] for run in runs})
     note = f"{', '.join(runs[0]['biased'])}; seeds {', '.join(map(str, seeds))}; the warm start is included.{more}"
     scored, distances = [], []
-    losses: dict[str, list[Point]] = {}  # by objective: the validation losses of two have no common scale
+    losses: dict[
+        str, list[Point]
+    ] = {}  # by objective, since losses of different objectives are not comparable
     for method, mine in methods.items():
         for place in range(min(len(run["curve"]) for run in mine)):
             points = [(run["curve"][place], run) for run in mine]
@@ -93,19 +95,19 @@ def series(
 
 
 def biased_ap(point: Mapping[str, Any], run: Results) -> float:
-    """Return the mean AP of the biased classes at a point of a run's curve, without those that the test set lacks."""
+    """Return the mean AP of the biased classes at a point of a run's curve, ignoring classes not in the test set."""
     known = [point["ap"]["per_class"].get(name) for name in run["biased"]]
     return fmean(value for value in known if value is not None)
 
 
 def distance(run: Results) -> float:
-    """Return the learned distribution's total variation to the target's, mean over biased objects and factors."""
+    """Return the total variation between learned and target distribution, mean over biased objects and factors."""
     away = run["total_variation"]
     return fmean(factor["learned"] for name in run["biased"] for factor in away[name].values())
 
 
 def seconds_to_half(run: Results, clock: Clock) -> float:
-    """Return seconds at the first scored point with half of the gap from ns to matched won back, or infinity."""
+    """Return seconds until the first scored point that closes half of the gap from ns to matched, or infinity."""
     ns, matched = (biased_ap({"ap": run["ap"][which]}, run) for which in ("ns", "matched"))
     wanted = 0.5 * (ns + matched)
     reached = [point[clock] for point in run["curve"] if biased_ap(point, run) >= wanted]
@@ -113,7 +115,7 @@ def seconds_to_half(run: Results, clock: Clock) -> float:
 
 
 def half(runs: Sequence[Results], clock: Clock) -> str:
-    """Say when half of the gap was won back: mean over the seeds that did, and how many."""
+    """Say when half of the gap was closed: mean over the seeds that closed it, and their number."""
     reached = [spent for run in runs if math.isfinite(spent := seconds_to_half(run, clock))]
     if not reached:
         return f"half the gap: never in {len(runs)}"
@@ -121,6 +123,6 @@ def half(runs: Sequence[Results], clock: Clock) -> str:
 
 
 def objective_of(run: Results) -> str:
-    """Return the name of a run's outer objective; older runs have it as a word, not as a class."""
+    """Return the name of a run's outer objective; older runs stored a word instead of a class."""
     objective = run["config"]["outer"]["objective"]
     return objective if isinstance(objective, str) else objective["_target_"].rpartition(".")[2]

@@ -1,4 +1,4 @@
-"""A detector small enough for its dense Hessian, trained on two objects: where solvers meet their oracle."""
+"""A detector small enough for a dense Hessian, trained on two objects, to compare solvers with a dense reference."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SIZE = 32
 
 
 def small_scene() -> Scene:
-    """Make two textured blocks before clutter, 32 px."""
+    """Make a scene of two textured blocks in front of clutter, at 32 pixels."""
 
     def block(seed: int) -> GridField:
         field = GridField().eval()
@@ -51,7 +51,7 @@ def small_scene() -> Scene:
 def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[InnerProblem, list[Term]]:
     """Train a detector on ``images`` of each object; return its inner problem and L_val.
 
-    The problem is of one image of every bin and object, which has its bin's probability as weight, shared by the
+    The inner problem has one image per bin and object, weighted by the probability of the bin divided by the number of
     objects. Both are in float64.
     """
     generator, scene = torch.Generator().manual_seed(0), small_scene()

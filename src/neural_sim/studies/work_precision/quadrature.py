@@ -1,10 +1,10 @@
-"""Error of the volume rendering quadrature against samples a ray, for smooth, sharp and thin densities.
+"""Error of the volume rendering quadrature against samples per ray, for smooth, sharp and thin densities.
 
-Theory for a step h. The midpoint rule is of second order where density and colour are smooth (Davis and Rabinowitz,
-Methods of Numerical Integration), and of first order where density jumps: a jump at a random place in a cell
-misplaces up to h/2 of the density. One sample at random in each interval: independent errors of h^2 each, 1/h of them,
-so that their root mean square is of order 3/2 (Haber 1966); of first order at a jump. A shell thinner than the step is
-hit or missed, so that there is no order until the step resolves it.
+Theory for a step h: the midpoint rule is of second order if density and colour are smooth (Davis and Rabinowitz,
+Methods of Numerical Integration), and of first order if the density jumps, since a jump at a random place in a cell
+misplaces up to h/2 of the density. One random sample per interval makes 1/h independent errors of size h^2, so that
+their root mean square is of order 3/2 (Haber 1966), and of first order at a jump. A shell thinner than the step is hit
+or missed, so that there is no order until the step resolves it.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from neural_sim.ranges import Ascending, validated
 from neural_sim.studies.work_precision.series import Order, Point, Series, Timing, slope
 
 SPAN = 2.0
-"""Length of every ray in object radii: the unit sphere's diameter."""
+"""Length of every ray in object radii: the diameter of the unit sphere."""
 FINER = 16
-"""Samples of the reference, in those of the finest setting."""
+"""Samples of the reference, as a multiple of the finest setting's."""
 AT_ONCE = 1 << 18
-"""Samples of the reference that are composited together."""
+"""Number of reference samples composited at a time."""
 WIDE, THICKNESS = 0.6, 0.02
-"""Of the sharp box and of the thin shell, in object radii, on average over rays."""
+"""Mean thickness over rays of the sharp box and of the thin shell, in object radii."""
 DEPTH = 1.0
-"""Optical depth of both, on average over rays."""
+"""Mean optical depth over rays of both."""
 RULES = ("midpoint", "jittered")
 
 Along = Float[Tensor, "rays samples"]
@@ -55,16 +55,16 @@ class Density:
 
 
 def _blob(distance: Along, offset: Along) -> Along:
-    """Return a Gaussian, still dense at both ends of the ray: one that vanishes there is integrated far too well."""
+    """Return a Gaussian that is nonzero at both ends of the ray; one that vanishes there is integrated too well."""
     return 3.0 * torch.exp(-(((distance - 0.9 - 0.2 * offset) / 0.7) ** 2))
 
 
 def box(
     thickness: float, offset: Float[Tensor, "*rays"]
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
-    """Return where a box of about this thickness begins and ends on each ray.
+    """Return where a box of about this thickness starts and ends on each ray.
 
-    Both ends vary by themselves: with one thickness for all rays the errors at its two jumps would cancel for some
+    Both ends vary independently: with the same thickness on all rays, the errors at the two jumps would cancel for some
     steps and add up for others.
     """
     begin = 0.6 + 0.2 * offset
@@ -97,7 +97,7 @@ def rendered(
 ) -> Float[Tensor, "rays 4"]:
     """Return colour and opacity of the rays by the project's quadrature.
 
-    Samples are at the middle of their intervals, or at random in them with a generator.
+    Samples are at the middle of their intervals or, with a generator, at random places in them.
     """
     rays, step = len(offset), SPAN / samples
     inside = offset.new_full((rays, samples), 0.5)
@@ -126,9 +126,9 @@ class Quadrature:
     """The family ``quadrature``.
 
     Args:
-        samples: numbers of samples a ray, growing.
-        default: the project's own: one for each cell of a grid field along the unit sphere's diameter.
-        rays: of every density, at random places.
+        samples: numbers of samples per ray, increasing.
+        default: the default number: one per cell of a grid field along the diameter of the unit sphere.
+        rays: number of rays through each density, at random places.
     """
 
     samples: Annotated[tuple[Annotated[int, Ge(2)], ...], MinLen(2), Ascending(strictly=True)] = (
@@ -145,12 +145,12 @@ class Quadrature:
 
     @property
     def counts(self) -> list[int]:
-        """All numbers of samples, the default among them."""
+        """All numbers of samples, including the default."""
         return sorted({*self.samples, self.default})
 
     def measure(self, world: object, timing: Timing, seed: int) -> Iterator[Series]:
         """Measure root mean square errors over rays, of opacity and of colour, in float64."""
-        del world  # the densities are its own
+        del world  # this family has its own densities
         for name, density in DENSITIES.items():
             offset = torch.rand(self.rays, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
             truth = reference(density, offset, FINER * self.counts[-1])

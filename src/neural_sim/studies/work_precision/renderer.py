@@ -1,4 +1,4 @@
-"""Error of rendered images against the pixels and samples that a renderer leaves out."""
+"""Error of rendered images against the pixels and samples that a renderer skips."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ FIELD_OF_VIEW = math.radians(40.0)
 
 @dataclass(frozen=True)
 class Left:
-    """What a renderer left out of an image of one object, and what that changed.
+    """What a renderer skipped in an image of one object, and the resulting errors.
 
     ``opacity`` is the mean error over the pixels that show the object, ``colour`` the root mean square error of
-    premultiplied colour over all; ``cast`` is the part of the pixels whose rays were cast, ``samples`` those of a ray
-    that hits.
+    premultiplied colour over all pixels; ``cast`` is the fraction of pixels whose rays were cast, ``samples`` the
+    number of samples per ray that hits.
     """
 
     opacity: float
@@ -42,7 +42,7 @@ class Left:
 def variants(
     renderer: NerfRenderer, terminations: Sequence[float], steps: Sequence[float]
 ) -> dict[str, NerfRenderer]:
-    """Make renderers by ``line, setting``: the qualities, the run's own with one omission undone or changed."""
+    """Make renderers by ``line, setting``: all qualities, and the run's own with one saving undone or changed."""
     own: dict[str, object] = {"termination": renderer.termination, "step": renderer.step}
     own |= {"cull": renderer.cull, "skip_empty": renderer.skip_empty}
 
@@ -62,7 +62,7 @@ def variants(
 def left_out(
     field: RadianceField, renderer: NerfRenderer, camera: PinholeCamera, poses: Float[Tensor, "views 4 4"]
 ) -> Left:
-    """Compare with a render of the same field that leaves out nothing, at the field's own step."""
+    """Compare with a render of the same field that skips nothing, at the step of the field."""
     rgb, opacity = renderer.render(field, camera, poses)
     every_rgb, every_opacity = renderer.render(field, camera, poses, exact=True)
     shown = (opacity > SHOWN) | (every_opacity > SHOWN)
@@ -86,9 +86,9 @@ class Renderer:
 
     Args:
         size: pixels a side.
-        views: held-out poses of which images are rendered.
-        terminations: transmittances behind which samples are skipped.
-        steps: factors of the field's step.
+        views: number of held-out poses to render.
+        terminations: transmittances beyond which samples are skipped.
+        steps: multiples of the field's step.
     """
 
     size: PositiveInt = 96
@@ -97,7 +97,7 @@ class Renderer:
     steps: tuple[Positive, ...] = (1.5, 3.0)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Measure means over the run's objects; seconds an image."""
+        """Measure means over the objects of the run; seconds are per image."""
         del seed  # nothing is random
         poses = world.views.camera_to_world[-world.held_out :][: self.views]
         camera = PinholeCamera(self.size, self.size, FIELD_OF_VIEW)

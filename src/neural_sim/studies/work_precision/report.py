@@ -1,4 +1,4 @@
-"""What ``+experiment=work_precision`` leaves: a document, tables, figures, and sections of a documentation page."""
+"""Output of ``+experiment=work_precision``: a document, tables, figures, and sections of a documentation page."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ Row = Mapping[str, Any]
 
 
 def document(series: Sequence[Series], machine: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of work_precision.json; numbers that do not exist are null.
+    """Return the content of work_precision.json; undefined numbers are null.
 
-    It has a row a setting under ``series``, the observed orders, what was measured, and defaults that are not
-    Pareto-optimal.
+    It has one row per setting under ``series``, the observed orders, notes on what was measured, and the defaults that
+    are not Pareto-optimal.
     """
     rows, orders, overtaken = [], [], []
     for each in series:
@@ -61,7 +61,7 @@ def _ratio(mine: float, other: float) -> float | None:
 
 
 def markdown(held: Mapping[str, Any], family: str) -> str:
-    """Return one family's tables and observed orders, from the JSON's content."""
+    """Return the tables and observed orders of one family, from the content of the JSON file."""
     names = [name for name in held["measured"] if name.partition("/")[0] == family]
     clock = CLOCKS[held["measured"][names[0]]["clock"]]
     parts = [INTRODUCTION.format(clock=clock, **held["machine"])]
@@ -74,10 +74,10 @@ def markdown(held: Mapping[str, Any], family: str) -> str:
 
 
 def brief(held: Mapping[str, Any], family: str) -> str:
-    """Return one table of a family: of each series the default and, of every other line, the nearest in run time.
+    """Return one short table for a family: the default of each series, and the nearest setting of every other line.
 
-    Series without a default are left out where others have one. Of series without other lines, the Pareto-optimal
-    settings are shown. A note stands once for the series that share it.
+    Nearest means in run time. Series without a default are left out if others have one. For series without other
+    lines, the Pareto-optimal settings are shown. A note shared by several series appears once.
     """
     names = [name for name in held["measured"] if name.partition("/")[0] == family]
     decided = [name for name in names if any(row["default"] for row in held["series"] if row["name"] == name)]
@@ -175,10 +175,10 @@ def _overtaken(each: Row) -> str:
 
 
 def figure(series: Series) -> Figure:
-    """Draw error against run time, both logarithmic.
+    """Draw error against run time on logarithmic axes.
 
-    A line joins settings that differ in one number, Pareto-optimal ones are filled, a ring marks the default. Errors of
-    0 are at the lower edge.
+    Lines join settings that differ in one number, Pareto-optimal settings are filled, and a ring marks the default.
+    Errors of 0 are drawn at the lower edge.
     """
     made = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = made.add_subplot()
@@ -209,7 +209,7 @@ def figure(series: Series) -> Figure:
 
 
 def _draw_line(axes: Any, series: Series, points: Sequence[Point], number: int, least: float) -> None:
-    """Draw one line's settings, the optimal ones filled."""
+    """Draw the settings of one line, filling the optimal ones."""
     colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
     marker = "os^Dvp*X"[number // len(figures.CLASS_COLOURS) % 8]
     best = dict(zip((p.setting for p in series.points), series.pareto, strict=True))
@@ -225,12 +225,12 @@ def _draw_line(axes: Any, series: Series, points: Sequence[Point], number: int, 
 
 
 def slug(name: str) -> str:
-    """Return a series' name as a file's."""
+    """Return the name of a series as a file name."""
     return "".join(letter if letter.isalnum() else "_" for letter in name).replace("__", "_").strip("_")
 
 
 def text_of(held: Mapping[str, Any]) -> str:
-    """Return every family's section, from the JSON's content."""
+    """Return the sections of all families, from the content of the JSON file."""
     sections = [f"## {family}\n\n{markdown(held, family)}" for family in _families(held)]
     return "\n\n".join(["# Error against run time", *sections])
 
@@ -242,7 +242,7 @@ def _families(held: Mapping[str, Any]) -> list[str]:
 def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
     """Rewrite the sections of ``page``, see ``documents.replace_section``; a page without any gets all families.
 
-    The page has ``brief`` tables; the whole ones, of every family, go to the JSON file of the same name.
+    The page has the ``brief`` tables; the full tables of every family go to the JSON file of the same name.
     """
     file = page.with_suffix(".json")
     text = page.read_text(encoding="utf-8") if page.is_file() else ""

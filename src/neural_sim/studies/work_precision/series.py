@@ -16,13 +16,13 @@ from neural_sim.ranges import PositiveInt, validated
 
 T = TypeVar("T")
 Clock = Literal["cpu_seconds", "seconds"]
-"""Processor time of all threads, which other work on the machine hardly changes, or time on the wall."""
+"""CPU time of all threads, which other work on the machine hardly affects, or wall-clock time."""
 CLEARLY = 0.9
-"""Part of a default's time below which another setting of no larger error beats it: timings vary by some percent."""
+"""A setting beats a default if it takes less than this fraction of its time; timings vary by a few percent."""
 RECORDED = 0.1
-"""Seconds up to which a run's memory is measured: the record of a longer run's allocations takes gigabytes."""
+"""Longest run, in seconds, whose memory is measured; recording the allocations of longer ones takes gigabytes."""
 SHORTEST = 0.05
-"""Seconds that a timed run takes at least; shorter ones are repeated within it."""
+"""Shortest time, in seconds, that is measured; shorter runs are repeated to fill it."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Point:
 
     Attributes:
         setting: its name.
-        error: at least 0, of the kind that the series names.
-        seconds: by the series' clock.
-        memory_mb: the most that tensors took at one time in MiB; None where it was not measured.
-        default: whether it is the project's own.
-        line: the settings that a line in the figure joins (those that differ in one number).
+        error: nonnegative error, of the kind that the series names.
+        seconds: run time by the clock of the series.
+        memory_mb: peak memory of tensors in MiB; None if it was not measured.
+        default: whether this is the default setting.
+        line: name of the line in the figure, which joins settings that differ in one number.
         detail: further text for the table.
     """
 
@@ -65,10 +65,10 @@ class Order:
 class Series:
     """Settings of one computation whose errors and run times can be compared.
 
-    ``name`` begins with its family and a slash. ``note`` says what was measured, against which reference.
+    ``name`` starts with the family and a slash. ``note`` says what was measured, and against which reference.
 
     Raises:
-        ValueError: no point, two of the same setting, or a negative error or time.
+        ValueError: there is no point, two have the same setting, or an error or a time is negative.
     """
 
     name: str
@@ -97,9 +97,9 @@ class Series:
         return pareto([(point.error, point.seconds) for point in self.points])
 
     def overtaken(self) -> Iterator[tuple[Point, Point]]:
-        """Yield every default that another setting beats beyond the noise of timings, with the fastest of these.
+        """Yield every default that is beaten by more than the noise of timings, with the fastest setting that beats it.
 
-        That is one of at most its error, in at most ``CLEARLY`` of its time.
+        A setting beats the default if its error is not larger and it takes at most ``CLEARLY`` of its time.
         """
         for mine in self.points:
             ahead = [o for o in self.points if o.error <= mine.error and o.seconds <= CLEARLY * mine.seconds]
@@ -108,9 +108,9 @@ class Series:
 
 
 def pareto(costs: Sequence[tuple[float, float]]) -> tuple[bool, ...]:
-    """Return which of the pairs no other dominates: is at most as large in both numbers and smaller in one.
+    """Return which pairs are not dominated by another, that is, no larger in both numbers and smaller in one.
 
-    Pairs with a number that is nan or infinite are never optimal and dominate nothing.
+    Pairs that contain NaN or infinity are never optimal and dominate nothing.
     """
     usable = [all(math.isfinite(value) for value in pair) for pair in costs]
     return tuple(
@@ -129,10 +129,10 @@ def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
 def slope(steps: Sequence[float], errors: Sequence[float]) -> float:
     """Return the least-squares slope of log ``errors`` over log ``steps``.
 
-    It is nan where an error is 0 or there are fewer than two.
+    It is NaN if an error is 0 or there are fewer than two.
 
     Raises:
-        ValueError: sequences of different lengths, or a step that is not positive.
+        ValueError: the sequences have different lengths, or a step is not positive.
     """
     if len(steps) != len(errors) or any(step <= 0.0 for step in steps):
         raise ValueError(f"slope: want a positive step for each error, got {list(steps)} and {list(errors)}")
@@ -153,22 +153,22 @@ class Timing:
     clock: Clock = "cpu_seconds"
 
     def now(self, device: torch.device | None = None) -> float:
-        """Return seconds of the clock, after the device's work."""
+        """Return the time of the clock in seconds, after the device has finished its work."""
         if device is not None:
             synchronise(device)
         return time.process_time() if self.clock == "cpu_seconds" else time.perf_counter()
 
     def once(self, run: Callable[[], T], device: torch.device | None = None) -> tuple[float, T]:
-        """Return seconds of one run, for what takes long, and its result."""
+        """Return the seconds of a single run, for long computations, and its result."""
         begun = self.now(device)
         value = run()
         return self.now(device) - begun, value
 
     def of(self, run: Callable[[], object], device: torch.device | None = None) -> tuple[float, float | None]:
-        """Return seconds and memory (MiB) of ``run``; the run whose memory is measured does not count for the seconds.
+        """Return seconds and peak memory (MiB) of ``run``; memory is measured in a separate run that is not timed.
 
-        One that takes less than ``SHORTEST`` is run as often as fills that, which gives its mean. Memory is None for
-        one that takes longer than ``RECORDED``.
+        A run that takes less than ``SHORTEST`` is repeated to fill that time, and the mean is returned. Memory is None
+        if a run takes longer than ``RECORDED``.
         """
         first = self.once(run, device)[0]
         memory = peak_bytes(run, device) / 2**20 if first < RECORDED else None

@@ -1,4 +1,4 @@
-"""The inverse-Hessian product by every solver, damping and product mode, against dense oracles."""
+"""The inverse-Hessian product by every solver, damping and product mode, compared with dense references."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from neural_sim.studies.work_precision.world import World
 from neural_sim.types import LabelledImages
 
 UNKNOWNS = 200
-"""Of the linear systems of a given condition number."""
+"""Size of the linear systems with a given condition number."""
 TIGHT = 1e-12
-"""Relative residual that a solve by steps is asked for, so that its steps end it."""
+"""Tolerance of solves with a given number of steps, small enough never to end them early."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ PRODUCTS = {
 
 @dataclass(frozen=True)
 class Setting:
-    """A solver of a table, the line of the figure that it is on, and whether it is the project's own."""
+    """A solver in a table, its line in the figure, and whether it is the default."""
 
     name: str
     line: str
@@ -81,7 +81,7 @@ class Oracle:
 
 @dataclass(frozen=True)
 class Inverse:
-    """(H + lambda I)^-1 dL_val/dtheta of a detector whose Hessian is dense enough for an oracle."""
+    """(H + lambda I)^-1 dL_val/dtheta for a detector small enough for a dense reference solution."""
 
     terms: Sequence[Term]
     params: Parameters
@@ -94,7 +94,7 @@ class Inverse:
 
     @staticmethod
     def of(problem: InnerProblem, validation: list[Term], timing: Timing, seed: int) -> Inverse:
-        """Decompose a problem's Hessian, for the slope of ``validation``."""
+        """Decompose the Hessian of a problem, for the gradient of ``validation``."""
         params, terms = problem.params, problem.terms()
         b = gradient(validation, params)
         spent, oracle = timing.once(lambda: Oracle.of(terms, params, b))
@@ -106,7 +106,7 @@ class Inverse:
         return solver.damping.choose(solver.operator(self.terms, self.params), self.b, random).value
 
     def series(self, name: str, settings: Sequence[Setting], damping: float, more: str) -> Series:
-        """Solve by every setting, and compare with the oracle of one damping."""
+        """Solve with every setting, and compare with the dense solution at the same damping."""
         truth = self.oracle.solve(damping)
         points = tuple(self._point(setting, truth) for setting in settings)
         low, high = (float(self.oracle.values[place]) + damping for place in (0, -1))
@@ -128,7 +128,7 @@ class Inverse:
         products = found.solution.products + (spectrum.products if spectrum else 0)
         seconds, memory = self.timing.of(solve)
         detail = f"{products} products, {_words(found.solution)}"
-        if found.damping_raises:  # it solved another system than the oracle did
+        if found.damping_raises:  # it solved a different system from the reference
             detail += f", lambda raised to {found.damping.value:.3g}"
         error = relative(found.solution.value, truth)
         return Point(setting.name, error, seconds, memory, setting.default, setting.line, detail)
@@ -144,18 +144,18 @@ class Solver:
     """The family ``solver``.
 
     Args:
-        solvers: by name; the dense one is the oracle and has no place among them.
+        solvers: solvers by name; the dense one is the reference and not among them.
         detector: makes the detector of the solves, small enough for a dense Hessian.
         timed: makes the detector whose Hessian products are timed.
-        default: the project's own among ``solvers``.
-        rtols: relative residuals of solves that choose their own damping, beside the configured one.
-        steps: of the solves with a given damping.
-        factors: of the damping that the default chooses; a series each.
-        conditions: condition numbers of linear systems; a series each.
-        images: of ``timed``, at ``size`` pixels a side.
+        default: the default among ``solvers``.
+        rtols: relative residuals of solves that choose their own damping, in addition to the configured one.
+        steps: numbers of steps of solves with a given damping.
+        factors: multiples of the damping that the default chooses; one series each.
+        conditions: condition numbers of linear systems; one series each.
+        images: number of images for ``timed``, at ``size`` pixels a side.
 
     Raises:
-        ValueError: an unknown default.
+        ValueError: the default is unknown.
     """
 
     solvers: Mapping[str, AdjointSolver] = field(default_factory=lambda: {"cg": AdjointSolver()})
@@ -177,7 +177,7 @@ class Solver:
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
         """Measure on the detector of ``micro``, on linear systems, and products of the run's kind of detector."""
-        del world  # its problems are its own
+        del world  # this family has its own problems
         if self.detector is not None:
             yield from self._inverse(Inverse.of(*trained_problem(self.detector), timing, seed))
         for condition in self.conditions:
@@ -195,7 +195,7 @@ class Solver:
             yield problem.series(f"lambda {value:.3g} given", list(self._given(value)), value, more)
 
     def _given(self, value: float) -> Iterator[Setting]:
-        """Yield solvers by steps, with a lambda that is given."""
+        """Yield solvers by number of steps, at a given lambda."""
         fixed = FixedDamping(value, 0)
         for name, solver in self.solvers.items():
             once = name == "identity"  # takes no steps
@@ -204,7 +204,7 @@ class Solver:
                 yield Setting(name if once else f"{name}, {steps} steps", name, asked)
 
     def _own(self) -> Iterator[Setting]:
-        """Yield solvers by tolerance, each with its own damping, and the default by other products."""
+        """Yield solvers by tolerance, each with its own damping, and the default with other Hessian products."""
         own = self.solvers[self.default]
         others = {
             f"{self.default}, {how}": product.of(own)
@@ -220,7 +220,7 @@ class Solver:
                 yield Setting(f"{name}, rtol {rtol:g}", name, replace(solver, rtol=rtol), default)
 
     def _system(self, condition: float, timing: Timing, seed: int) -> Series:
-        """Solve for eigenvalues spread evenly in log from 1 to 1 / condition; the truth is chosen first."""
+        """Solve systems with log-spaced eigenvalues from 1 to 1 / condition, constructed from a known solution."""
         generator = torch.Generator().manual_seed(seed)
         basis, _ = torch.linalg.qr(torch.randn(UNKNOWNS, UNKNOWNS, generator=generator, dtype=torch.float64))
         truth = torch.randn(UNKNOWNS, generator=generator, dtype=torch.float64)
@@ -280,7 +280,7 @@ def relative(value: Float[Tensor, "n"], truth: Float[Tensor, "n"]) -> float:
 def product_problem(
     make: Callable[..., Detector], images: int, size: int, seed: int
 ) -> tuple[list[Term], Parameters, list[Term]]:
-    """Return loss terms of an untrained detector on random pictures of a box, its parameters, the terms in float64."""
+    """Return loss terms of an untrained detector on random pictures of a box, its parameters, and float64 terms."""
     generator, detector = torch.Generator().manual_seed(seed), make(num_classes=6, image_size=size)
     backbone, params = detector.split(detector.init(generator))
     corner = 0.5 * size * torch.rand(images, 1, 2, generator=generator)

@@ -1,4 +1,4 @@
-"""``+experiment=work_precision``: error against run time wherever a default is decided."""
+"""``+experiment=work_precision``: error against run time for every choice that sets a default."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ Name = Literal[
     "quadrature", "renderer", "field", "solver", "hypergradient", "estimator", "derivative", "loop"
 ]  # fmt: skip
 FAMILIES: tuple[Name, ...] = get_args(Name)
-"""In the order of the loop; each is a key of the settings."""
+"""Families in the order of the psi loop; each is a key of the settings."""
 COMMAND = "python -m src.main +experiment=work_precision"
-"""What a documentation page says that makes its sections; they are to be made at its scale, quick."""
+"""Command that a documentation page gives for its sections, which are made at its scale, quick."""
 READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
     "renderer": lambda graph: graph.fields,
     "field": lambda graph: graph.views,
@@ -45,7 +45,7 @@ READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
     "derivative": lambda graph: graph.fields,
     "loop": lambda graph: [graph.learned, graph.targets],
 }
-"""The stages that a family reads."""
+"""Stages that each family reads."""
 
 
 @validated
@@ -55,8 +55,8 @@ class WorkPrecision(Task):
 
     Args:
         families: which of the other keys are measured, in this order.
-        repeats: runs whose median time counts.
-        clock: ``cpu_seconds``, processor time, or ``seconds``, on the wall.
+        repeats: number of timings; their median is reported.
+        clock: ``cpu_seconds`` of CPU time, or ``seconds`` of wall-clock time.
         docs: a Markdown page whose sections on the measured families are rewritten; null: none.
         quadrature: settings of a family.
         renderer: likewise.
