@@ -1,7 +1,9 @@
-"""Images a second and memory of an export, by size, objects an image and format: `python benchmarks/export.py`.
+"""Images per second and memory of an export, by image size, objects per image and format.
 
-Fits fields to the embedded objects, then writes data sets into a temporary folder. Times are those of the images
-(drawing, rendering, composing, encoding, writing), without fitting and without the final annotations.
+    python benchmarks/export.py
+
+Fits fields to the embedded objects, then writes data sets to a temporary folder. Times cover drawing, rendering,
+composing, encoding and writing the images, but not the fits and the final annotations.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from neural_sim.types import PinholeCamera
 
 
 def source_of(fields: dict[str, RadianceField], quality: Quality) -> ImageSource:
-    """Poses uniform round the objects, at 2.4 to 4 radii, as in a run."""
+    """Return a source of images with uniform poses around the objects, at 2.4 to 4 radii, as in a run."""
     distribution = SceneDistribution.of([Pose()])
     camera = PinholeCamera(96, 96, math.radians(40.0))
     subjects = tuple(FieldSubject(name, field, NerfRenderer(quality)) for name, field in fields.items())
@@ -45,7 +47,7 @@ def source_of(fields: dict[str, RadianceField], quality: Quality) -> ImageSource
 
 
 def sized(source: ImageSource, width: int, height: int, objects: int) -> ImageSource:
-    """Return the source with images of another size and number of objects."""
+    """Return the source with another image size and number of objects per image."""
     synthesizer = replace(source.scene.synthesizer, objects_per_image=(objects, objects))
     camera = reframed(source.scene.camera, width, height)
     return replace(source, camera=camera, scene=replace(source.scene, synthesizer=synthesizer))
@@ -54,7 +56,7 @@ def sized(source: ImageSource, width: int, height: int, objects: int) -> ImageSo
 def measured(
     source: ImageSource, count: int, workers: int, bop: bool, image_format: ImageFormat
 ) -> dict[str, float]:
-    """Seconds and processor seconds an image; the first image of each process is not timed: it starts them."""
+    """Measure seconds and CPU seconds per image, without the first image of each process, which includes its start."""
     with tempfile.TemporaryDirectory() as folder:
         writer = ImageWriter(source, Path(folder), image_format, 1000 if bop else None, 0.01)
         first = max(workers, 1)
@@ -77,7 +79,7 @@ def _alone(queue, *arguments) -> None:
 
 
 def in_process(*arguments) -> dict[str, float]:
-    """``measured`` in a process of its own, with that process's largest memory."""
+    """Call ``measured`` in a separate process and add the peak memory of that process."""
     context = multiprocessing.get_context("spawn")
     queue = context.Queue()
     process = context.Process(target=_alone, args=(queue, *arguments))
@@ -88,7 +90,7 @@ def in_process(*arguments) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure as the command line asks."""
+    """Parse the command line and run the measurements."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", help="a folder in the YCB layout; without it the embedded objects")
     parser.add_argument("--names", nargs="*")

@@ -1,8 +1,11 @@
-"""Kill a run at random moments, damage its files, count what is lost: `python benchmarks/faults.py --out faults.json`.
+"""Kill a run at random moments, damage its files, and count what is lost.
 
-One small run, from objects to a report and a data set, is the reference. Then the same command is killed and started
-again, in chains on one store, until it ends; every chain must leave the reference's results, bit for bit. Bits of the
-store's files are flipped and files cut off, and none may be used. At last several of the command are begun at one time.
+    python benchmarks/faults.py --out faults.json
+
+The reference is one small run, from objects to a report and a data set. The same command is then killed and restarted
+on one store until it finishes; every such chain must reproduce the results of the reference bit for bit. Next, bits of
+stored files are flipped and files truncated; no damaged file may be used. Last, several runs of the command are started
+at the same time.
 """
 
 from __future__ import annotations
@@ -41,17 +44,17 @@ SMALL = [
     "export.count=12", "export.workers=0", "export.detail=run",
 ]  # fmt: skip
 LOADED = ["neural_sim.main", "neural_sim.tasks.walk", "mlflow", "faster_coco_eval", "matplotlib.pyplot"]
-"""Modules that processes import before they begin, so that they are killed while they work."""
+"""Modules that processes import in advance, so that they are killed at work and not while importing."""
 ITERATION = re.compile(r"psi (\d+)/\d+:")
 ENDS = {"report": "results.json", "export": "dataset"}
-"""Parts of a run that leave no result in the store; each has begun when this file or folder is there."""
+"""Phases of a run without a result in the store; each has started once this file or folder exists."""
 TAKEN_UP = re.compile(r"psi loop: goes on after round (\d+)/")
 FIELD_EVERY = 0.5
-"""Seconds between checkpoints of a field, which takes seconds here and a day at most."""
+"""Seconds between checkpoints of a field; short, because fits here take seconds."""
 
 
 def run_command(arguments: list[str], log: str) -> None:
-    """Run the program in this process, which writes what it says to a file."""
+    """Run the program in this process, with its output in a file."""
     from neural_sim import main
     from neural_sim.stages import field as fields
 
@@ -65,7 +68,7 @@ def run_command(arguments: list[str], log: str) -> None:
 
 @dataclass
 class Place:
-    """A store, a database and the folders of runs on them."""
+    """A store, a database and the folders of the runs that use them."""
 
     root: Path
     runs: int = 0
@@ -87,7 +90,7 @@ class Place:
         return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
 
     def start(self) -> Any:
-        """Start the command in a process and a folder of its own."""
+        """Start the command in a new process and a new folder."""
         self.runs += 1
         paths = [f"paths.store={self.root}/store", f"paths.mlflow={self.root}/mlflow.db"]
         arguments = [*SMALL, *paths, f"hydra.run.dir={self.run}"]
@@ -96,7 +99,7 @@ class Place:
         return process
 
     def bits(self) -> dict[str, str]:
-        """Return digests of all results, without times, and of the data set."""
+        """Return digests of all results, excluding times, and of the data set."""
         found = {}
         for path in sorted(self.store.root.glob("*/[!.]*.pt")):
             entry = self.store.fetch(path.parent.name, path.stem, {}, functools.partial(_missing, path))
@@ -107,7 +110,7 @@ class Place:
         return found
 
     def at_work_on(self, kind: str) -> bool:
-        """Tell whether a process is making a result of a kind now, or has begun that part of the run."""
+        """Tell whether a process is making a result of this kind, or has started that phase of the run."""
         if kind in ENDS:
             return (self.run / ENDS[kind]).exists()
         held = Path("/proc/locks").read_text()
@@ -115,12 +118,12 @@ class Place:
         return any(re.search(rf":{path.stat().st_ino} ", held) for path in locks)
 
     def has_done(self, kind: str, count: int) -> bool:
-        """Tell whether all results of a kind are there."""
+        """Tell whether all results of a kind exist."""
         return kind not in ENDS and len(list(self.store.root.glob(f"{kind}/[!.]*.pt"))) >= count
 
 
 def _processes() -> Any:
-    """Return what makes processes that have imported the program already."""
+    """Return a multiprocessing context whose processes have the program imported already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(LOADED)
     return context
@@ -153,7 +156,7 @@ def _digest(value: Any) -> str:
 
 @dataclass
 class Ends:
-    """Counts of the processes that were ended by SIGKILL or SIGTERM, and of what followed."""
+    """Counts of processes ended by SIGKILL or SIGTERM, and of the consequences."""
 
     at: Counter[str] = field(default_factory=Counter)
     statuses: Counter[int] = field(default_factory=Counter)
@@ -169,10 +172,10 @@ class Ends:
 def chains(
     signum: signal.Signals, count: int, reference: Place, bits: Mapping[str, str], random: Random
 ) -> tuple[Ends, Path | None]:
-    """End processes ``count`` times, each at a moment of a kind of work that is left, and let every chain end.
+    """End ``count`` processes, each at a random moment of a kind of work still to be done, and let every chain finish.
 
     Returns:
-        What became of them, and a checkpoint that was met on the way.
+        The counts, and a checkpoint found on the way.
     """
     ends, ended, checkpoint, work = Ends(), 0, None, reference.root.parent
     parts = _parts(reference)
@@ -215,7 +218,7 @@ def chains(
 
 
 def _parts(reference: Place) -> dict[str, tuple[int, float]]:
-    """Return the number of results of each kind, and the seconds that the longest takes."""
+    """Return the number of results of each kind, and the time of the longest in seconds."""
     found: dict[str, tuple[int, float]] = {}
     for path in reference.store.root.glob("*/[!.]*.pt"):
         entry = reference.store.fetch(path.parent.name, path.stem, {}, functools.partial(_missing, path))
@@ -230,14 +233,14 @@ def _seconds(reference: Place, phase: str) -> float:
 
 
 def _wait(process: Any, place: Place, kind: str, seconds: float) -> None:
-    """Wait until a process is at work on a kind of result, and for some seconds more, or to its end."""
+    """Wait until a process works on this kind of result, and some seconds longer, or until it ends."""
     while process.is_alive() and not place.at_work_on(kind):
         time.sleep(0.01)
     process.join(seconds)
 
 
 def _iterations(log: str, done: int, ends: Ends) -> int:
-    """Return how many iterations had ended in a chain, and note those that a run did again."""
+    """Return the number of finished iterations in a chain, and count those that a run repeated."""
     if (taken := TAKEN_UP.search(log)) is not None:
         ends.taken_up += 1
         ends.iterations_lost = max(ends.iterations_lost, done - int(taken[1]))
@@ -255,7 +258,7 @@ def _running(database: Path) -> int:
 
 
 def damages(place: Place, checkpoint: Path | None, count: int, random: Random) -> dict[str, Any]:
-    """Flip bits of results and of a checkpoint, and cut them off; count what is read nevertheless."""
+    """Flip bits in results and a checkpoint, or truncate them; count damaged files that are read nevertheless."""
     kinds: Mapping[str, Callable[[bytes], bytes]] = {
         "flipped bit": functools.partial(_flipped, random=random),
         "truncation": lambda content: content[: random.randrange(len(content))],
@@ -282,7 +285,7 @@ def _flipped(content: bytes, random: Random) -> bytes:
 
 
 def together(work: Path, bits: Mapping[str, str], count: int) -> dict[str, Any]:
-    """Begin the command several times at one time, on one store and one database."""
+    """Start the command several times at once, on one store and one database."""
     place = Place(work / "together")
     place.root.mkdir()
     shutil.copy(work / "empty.db", place.root / "mlflow.db")
@@ -303,7 +306,7 @@ def together(work: Path, bits: Mapping[str, str], count: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run all, and write the document."""
+    """Run all parts and write the document."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50, help="by SIGKILL")
     parser.add_argument("--terms", type=int, default=20, help="by SIGTERM")

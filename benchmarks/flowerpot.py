@@ -1,9 +1,9 @@
-"""A detector of a real object, trained on renders of it alone and scored on photographs: what raises its AP.
+"""What raises the AP of a detector of a real object that is trained on renders and scored on photographs.
 
-The flowerpot of `<shared>/captures`, made from those of its photographs that have no label, without given cameras or
-masks, and five scanned YCB objects as other classes. It is scored on the labelled photographs of
-tests/data/flowerpot.json, close-ups that cut the pot at their upper edge. The scene's backgrounds are the first
-photographs, the pot erased from them.
+The object is the flowerpot in `<shared>/captures`, reconstructed from its unlabelled photographs, without given cameras
+or masks; five scanned YCB objects are the other classes. Detectors are scored on the labelled photographs in
+tests/data/flowerpot.json, close-ups in which the upper edge of the image cuts the pot off. The backgrounds called
+`scene` are the unlabelled photographs with the pot erased.
 
     python benchmarks/flowerpot.py --shared ../shared --out outputs/benchmarks/flowerpot
 """
@@ -31,7 +31,7 @@ LABELS = ROOT / "tests" / "data" / "flowerpot.json"
 OTHERS = ["002", "019", "024", "025", "035"]
 """A can, a pitcher, a bowl, a mug and a drill."""
 CAMERA = ["camera.width=96", "camera.height=71", "camera.fx=82"]
-"""The telephone's, by what COLMAP found: 854 pixels of 1,000."""
+"""Field of view of the phone, from the focal length that COLMAP found: 854 pixels for a width of 1,000."""
 CUT = ["synthesis.shift=0.5"]
 SCENE = [*CUT, "synthesis=photos", "synthesis.background.root={scene}"]
 SENSOR = ["synthesis.sensor.blur=[0,1]", "synthesis.sensor.noise=[0,0.03]"]
@@ -47,7 +47,7 @@ RUNS = {
 
 
 def overrides_of(options: argparse.Namespace) -> list[str]:
-    """Return what all runs have in common."""
+    """Return the overrides that all runs have in common."""
     images = options.shared / "captures" / "flowerpot" / "images"
     return [
         "name=flowerpot", f"scale={options.scale}", f"seed={options.seed}", "objects=photos", "objects/poses=colmap",
@@ -60,7 +60,7 @@ def overrides_of(options: argparse.Namespace) -> list[str]:
 
 
 def take_photographs(options: argparse.Namespace) -> None:
-    """Link the photographs without a label into a capture of their own."""
+    """Link the unlabelled photographs into a separate capture."""
     labelled = {image["file_name"] for image in json.loads(LABELS.read_text())["images"]}
     folder = options.out / "captures" / "flowerpot" / "images"
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def take_photographs(options: argparse.Namespace) -> None:
 
 
 def erase(options: argparse.Namespace) -> Path:
-    """Write the photographs without the pot: what is behind its mask is the blurred mean of what is around it."""
+    """Write the photographs with the pot erased: its mask is filled with a blurred mean of the surroundings."""
     folder = options.out / "scene"
     folder.mkdir(parents=True, exist_ok=True)
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
@@ -79,10 +79,10 @@ def erase(options: argparse.Namespace) -> Path:
     assert isinstance(source, Photos) and stage.masks is not None
     pictures = source.pictures(stage.object, context.results(stage.masks))
     for frame in pictures.capture.frames:
-        rgba = pictures.rgba(frame)[::2, ::2].numpy()  # half of the pixels a side are enough for a background
+        rgba = pictures.rgba(frame)[::2, ::2].numpy()  # half the resolution is enough for a background
         hidden = np.asarray(binary_dilation(rgba[..., 3] > 0.1, iterations=8), dtype=bool)
         filled = np.where(hidden[..., None], 0.0, rgba[..., :3])
-        for blur in (6.0, 20.0, 60.0):  # the nearest that reaches
+        for blur in (6.0, 20.0, 60.0):  # the smallest blur that reaches a pixel fills it
             seen = gaussian_filter((~hidden).astype(np.float32), blur)
             near = np.stack([gaussian_filter(filled[..., c] * ~hidden, blur) for c in range(3)], -1)
             reached = hidden & (seen > 0.02)
@@ -95,7 +95,7 @@ def erase(options: argparse.Namespace) -> Path:
 
 
 def main() -> None:
-    """Run what the command line asks for, and print the table."""
+    """Run the cases that the command line asks for, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

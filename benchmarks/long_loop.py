@@ -1,9 +1,9 @@
-"""A psi loop of many iterations: what its checkpoints cost, and whether its memory grows.
+"""Cost of checkpoints and growth of memory in a psi loop of many iterations.
 
     python benchmarks/long_loop.py --out long_loop.json
 
-What a process holds is not what it uses: ``used`` is what malloc has handed out, ``objects`` counts Python's blocks. A
-leak lets these grow; where only the resident set grows, it is made of fragments that malloc keeps.
+Resident memory is not the memory in use: ``used`` is what malloc has handed out, ``objects`` counts blocks of Python. A
+leak makes these grow; if only the resident set grows, malloc is keeping fragments.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Malloc(ctypes.Structure):
 
 
 def watched(keep: Callable[..., None], rows: list[dict[str, float]]) -> Callable[..., None]:
-    """Have each writing of the loop's checkpoint note its seconds, and the memory of the process then."""
+    """Wrap the writing of checkpoints to record its time and the memory of the process at that moment."""
     libc = ctypes.CDLL("libc.so.6")
     libc.mallinfo2.restype = Malloc
 
@@ -62,7 +62,7 @@ def watched(keep: Callable[..., None], rows: list[dict[str, float]]) -> Callable
 
 
 def main() -> None:
-    """Run the loop, and write the document."""
+    """Run the loop and write the document."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=200)
     parser.add_argument("--out", type=Path, help="a JSON file")

@@ -1,4 +1,4 @@
-"""What the benchmarks share: the option for a device, and memory."""
+"""Helpers shared by the benchmarks: the device option and memory measurements."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def memory_mb() -> tuple[float, float]:
-    """Resident memory of this process now, and at most since ``forget_peak``; MB. Linux counts both."""
+    """Return the resident memory of this process now and its peak since ``forget_peak``, in MB; Linux only."""
     status = Path("/proc/self/status")
     if not status.is_file():
         most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
@@ -29,7 +29,7 @@ def memory_mb() -> tuple[float, float]:
 
 
 def forget_peak(device: torch.device | None = None) -> None:
-    """Start the peaks of ``memory_mb`` and ``gpu`` anew, where the system can."""
+    """Reset the peaks of ``memory_mb`` and of the GPU, if the system can."""
     if device is not None:
         forget_gpu_peak(device)
     if Path("/proc/self/clear_refs").is_file():

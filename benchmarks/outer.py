@@ -1,10 +1,10 @@
 """Seconds of each phase of one outer iteration against objects and images: `python benchmarks/outer.py`.
 
-The loop is `scale=quick` at its defaults (96 px, detector=tiny, 100 training and 50 target images an object); any
-key can be changed, as in `python benchmarks/outer.py solver.rtol=1e-3`. The six embedded objects, their fields fitted
-in few steps, are repeated under new names where more are asked for. The goal on a GPU (21 classes, 50 images of 256
-px, under 20 s): `--device cuda --objects 21 --images -- training.image_size=256`. The backbone is untrained: what is
-learned changes, not the cost.
+The loop is `scale=quick` at its defaults (96 px, detector=tiny, 100 training and 50 target images per object); any
+key can be changed, as in `python benchmarks/outer.py solver.rtol=1e-3`. There are six embedded objects, with fields
+fitted in few steps; if more are asked for, they are repeated under new names. The goal on a GPU (21 classes, 50 images
+of 256 px, under 20 s): `--device cuda --objects 21 --images -- training.image_size=256`. The backbone is untrained,
+which changes what is learned but not the cost.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PHASES = (
 
 
 def repeated(scene: Scene, count: int) -> Scene:
-    """Repeat a scene's objects under new names until there are ``count``."""
+    """Repeat the objects of a scene under new names until there are ``count``."""
     index = [i % len(scene.names) for i in range(count)]
     subjects = tuple(
         dataclasses.replace(scene.fields[i], name=f"{scene.names[i]}_{label}")
@@ -52,7 +52,7 @@ def repeated(scene: Scene, count: int) -> Scene:
 
 
 def loop(context: Context, count: int, images: int) -> SimulatorModule:
-    """Make the psi loop on ``count`` objects with ``images`` training images of each, from uniform poses."""
+    """Make the psi loop for ``count`` objects with ``images`` training images each, starting from uniform poses."""
     generator = torch.Generator().manual_seed(0)
     scene = repeated(context.results(context.graph.scene), count)
     detector = context.experiment.detector(
@@ -74,7 +74,7 @@ def loop(context: Context, count: int, images: int) -> SimulatorModule:
 
 
 def measure(module: SimulatorModule, repeats: int) -> dict[str, float]:
-    """Medians over iterations, the first one (memory, kernels chosen) left out."""
+    """Return medians over iterations, excluding the first, which allocates memory and selects kernels."""
     walls, rows = [], []
     for step in range(repeats + 1):
         begun = time.perf_counter()
@@ -89,19 +89,19 @@ def measure(module: SimulatorModule, repeats: int) -> dict[str, float]:
 
 
 def exponent(rows: list[dict[str, Any]], size: str, key: str = "seconds") -> float:
-    """Least-squares slope of log seconds over log size."""
+    """Return the least-squares slope of log seconds over log size."""
     x = torch.tensor([math.log(row[size]) for row in rows], dtype=torch.float64)
     y = torch.tensor([math.log(row[key]) for row in rows], dtype=torch.float64)
     return float(((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum())
 
 
 def last_exponent(rows: list[dict[str, Any]], size: str) -> float:
-    """Return the slope between the two largest sizes, where what does not grow with them matters least."""
+    """Return the slope between the two largest sizes, which constant costs affect least."""
     return exponent(sorted(rows, key=lambda row: row[size])[-2:], size)
 
 
 def main() -> None:
-    """Measure as the command line asks."""
+    """Parse the command line and run the measurements."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("overrides", nargs="*", help="configuration keys, as on the command line of a run")
     parser.add_argument(

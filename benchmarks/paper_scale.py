@@ -1,7 +1,7 @@
 """Estimate the cost of `+experiment=pose_bin1_ycb +variant=paper scale=paper`: `python benchmarks/paper_scale.py`.
 
-It measures the processor seconds of a part of each kind of work, rays of the paper's network and images of its
-RetinaNet at 256 pixels, and multiplies them with the counts of the configuration.
+It measures the CPU seconds of a sample of each kind of work (rays through the paper's network, and images of its
+RetinaNet at 256 pixels) and multiplies them by the counts in the configuration.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from neural_sim.types import LabelledImages, Rays
 
 OBJECTS = 6
 PRODUCTS = 20
-"""Products with the Hessian in an iteration: of Lanczos' estimate, and of conjugate gradients."""
+"""Hessian products per iteration: for the Lanczos estimate, and for conjugate gradients."""
 
 
 def seconds(work: Callable[[], object], device: torch.device) -> float:
-    """Measure processor seconds, on a GPU those on the wall, of a second call; the first one allocates."""
+    """Measure CPU seconds, or wall-clock seconds on a GPU, of the second call, since the first allocates memory."""
     clock = time.process_time if device.type == "cpu" else time.perf_counter
     work()
     synchronise(device)
@@ -41,7 +41,7 @@ def seconds(work: Callable[[], object], device: torch.device) -> float:
 
 
 def of_rays(made: Experiment, count: int, device: torch.device) -> dict[str, float]:
-    """Measure seconds of a ray through the object's sphere."""
+    """Measure seconds per ray through the sphere of the object."""
     field = made.imaging.field.field().to(device).eval()
     aim = 0.5 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0)).clamp(-1.0, 1.0)
     origins = torch.tensor([0.0, 0.0, 3.0]).expand(count, 3)
@@ -63,7 +63,7 @@ def of_rays(made: Experiment, count: int, device: torch.device) -> dict[str, flo
 
 
 def of_images(made: Experiment, count: int, device: torch.device) -> dict[str, float]:
-    """Measure seconds of an image of the detector's."""
+    """Measure seconds per image for the detector."""
     size = made.training.image_size
     detector = made.detector(num_classes=OBJECTS, image_size=size)
     params = {k: v.to(device) for k, v in detector.init(torch.Generator().manual_seed(0)).items()}
@@ -100,7 +100,7 @@ def of_images(made: Experiment, count: int, device: torch.device) -> dict[str, f
 
 
 def whole_run(made: Experiment, budget: Mapping[str, Any], parts: Mapping[str, float]) -> dict[str, float]:
-    """Multiply the parts with the configuration's counts; in seconds."""
+    """Multiply the parts by the counts in the configuration; in seconds."""
     render, twice, step, trained, frozen, product = parts.values()
     near, far = made.imaging.distribution.ranges["distance"]
     slope = math.tan(math.radians(made.imaging.views.field_of_view_deg / 2.0))
@@ -126,7 +126,7 @@ def whole_run(made: Experiment, budget: Mapping[str, Any], parts: Mapping[str, f
 
 
 def main() -> None:
-    """Print the parts, and what they add up to."""
+    """Print the parts and their total."""
     parser = argparse.ArgumentParser(description=__doc__)
     add_device(parser)
     parser.add_argument("--rays", type=int, default=256)

@@ -1,9 +1,9 @@
-"""From photographs to a detector: exact ones, a telephone's, and a telephone's with corrected poses.
+"""From photographs to a detector: with exact poses, with a phone's, and with a phone's after refinement.
 
-Photographs of three YCB objects over clutter, by a distorted lens, with masks, as a COLMAP model. Those of a telephone
-have poses off by 1 % of the distance and brightness off by 10 %. The target's images are renders of the meshes with
-blur and noise, most of them from one side of the pitcher and of the drill; the psi loop starts from uniform poses. The
-last run goes on to an export from its psi and to a prediction by its detector.
+Photographs show three YCB objects over clutter through a distorted lens, with masks and a COLMAP model. Those of a
+phone have poses with errors of 1 % of the distance, and brightness with errors of 10 %. Target images are renders of
+the meshes with blur and noise, mostly from one side for the pitcher and the drill; the psi loop starts from uniform
+poses. The last run also exports a data set from its psi and predicts with its detector.
 
     python benchmarks/photographs.py --root ../shared/ycb --out outputs/benchmarks/photographs
 """
@@ -29,13 +29,13 @@ from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.types import LabelledImages
 
 KINDS = {"exact": (0.0, 0.0), "telephone": (0.01, 0.1)}
-"""Deviations of positions, in distances, and of log brightness."""
+"""Standard deviations of positions, relative to the distance, and of log brightness."""
 TARGET = {"019_pitcher_base": 3, "035_power_drill": 7}
 """Dominant pose bins of the target's images, one-based; other objects have uniform poses."""
 
 
 def make_captures(options: argparse.Namespace) -> None:
-    """Photograph every object, exactly and as a telephone would."""
+    """Photograph every object, exactly and as a phone would."""
     renderer = choose_mesh_renderer("auto", 1)
     for kind, (noise, exposure) in KINDS.items():
         for item in YCB(options.root, options.names).load():
@@ -47,7 +47,7 @@ def make_captures(options: argparse.Namespace) -> None:
 
 
 def make_target(options: argparse.Namespace, names: list[str]) -> Path:
-    """Labelled test images, as COCO."""
+    """Write labelled target images in COCO format."""
     biased = ",".join(f"{name}:{{target:{{dominant:{TARGET[name]}}}}}" for name in names if name in TARGET)
     overrides = [
         f"scale={options.scale}", "objects=ycb", f"objects.root={options.root}", f"objects.names=[{','.join(names)}]",
@@ -67,14 +67,14 @@ def stored(folder: Path) -> list[str]:
 
 
 def run(options: argparse.Namespace, folder: Path, *overrides: str) -> Path:
-    """Run the command line in a folder, and return it."""
+    """Run the command line in a folder, and return the folder."""
     command = [sys.executable, "-m", "src.main", *overrides, f"hydra.run.dir={folder}", *stored(options.out)]
     subprocess.run(command, check=True, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL)
     return folder
 
 
 def of_photographs(options: argparse.Namespace, kind: str, rounds: int) -> list[str]:
-    """Return the overrides that take the photographs as objects."""
+    """Return the overrides that use the photographs as objects."""
     return [
         f"scale={options.scale}", "objects=photos", "objects.up=-y", f"objects.root={options.out / kind}",
         f"objects.refinement.rounds={rounds}",
@@ -82,7 +82,7 @@ def of_photographs(options: argparse.Namespace, kind: str, rounds: int) -> list[
 
 
 def printed(what: str, ap: dict[str, float]) -> None:
-    """Print AP by class and its mean."""
+    """Print the AP of each class and the mean."""
     each = ", ".join(f"{name} {100 * value:.1f}" for name, value in ap.items())
     print(f"{what}: {each}, mean {100 * sum(ap.values()) / len(ap):.1f}", flush=True)
 

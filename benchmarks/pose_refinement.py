@@ -1,8 +1,8 @@
-"""Fields from views whose poses are off, before and after their correction, beside fields from true poses.
+"""Fields from views with wrong poses, before and after refinement, compared with fields from true poses.
 
-Quick scale's views and fields of YCB objects with `--root ../shared/ycb`, else of the embedded ones. A position is off
-by `--noise` of its distance from the object (standard deviation an axis), a rotation by the same number in radians.
-PSNR in dB of held-out views, of the pixels of the object; where poses are corrected, those of held-out views are too.
+Uses views and fields of scale=quick, of YCB objects with `--root ../shared/ycb`, else of the embedded ones. Positions
+have errors of `--noise` times the distance to the object (standard deviation per axis), rotations of the same number in
+radians. Scores are PSNR in dB over the pixels of the object in held-out views, whose poses are refined as well.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from neural_sim.types import PosedViews
 
 
 def disturbed(views: PosedViews, noise: float) -> PosedViews:
-    """Move the views to wrong poses, as photographs, whose silhouettes need not agree."""
+    """Give the views wrong poses, and treat them as photographs, whose silhouettes need not agree."""
     generator = torch.Generator().manual_seed(5)
     step = noise * torch.randn(len(views), 6, generator=generator)
     step[:, 3:] *= views.camera_to_world[:, :3, 3].norm(dim=-1, keepdim=True)
@@ -33,14 +33,14 @@ def disturbed(views: PosedViews, noise: float) -> PosedViews:
 
 
 def errors(views: PosedViews, truth: PosedViews) -> tuple[float, float]:
-    """Medians, in radii and degrees."""
+    """Return the median errors of positions in radii and of rotations in degrees."""
     a, b = views.camera_to_world, truth.camera_to_world
     turned = float(rotation_angle(a[:, :3, :3], b[:, :3, :3]).median())
     return float((a[:, :3, 3] - b[:, :3, 3]).norm(dim=-1).median()), math.degrees(turned)
 
 
 def main() -> None:
-    """Measure as the command line asks."""
+    """Parse the command line and run the measurements."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", help="a folder in the YCB layout; without it the embedded objects")
     parser.add_argument("--names", nargs="*")

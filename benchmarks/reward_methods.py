@@ -1,8 +1,8 @@
 """Compare methods that learn from rewards on a simulated reward: ``python benchmarks/reward_methods.py``.
 
-As in pose_gap, two of six objects begin at another bin than their target's. An object's score is concave in the
-probabilities of its target's bins, and trainings scatter as they do at scale=quick. The table has the mean score that
-is gained after so many trainings, and how far the two objects' p still is from their target (total variation).
+As in pose_gap, two of six objects start at another bin than their target's. The score of an object is concave in the
+probabilities of its target's bins, and trainings scatter as they do at scale=quick. The table shows the gain in mean
+score after a number of trainings, and the remaining total variation of the two objects from their target.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ METHODS = {
 
 
 def gained(method: LearningToSimulate, trainings: int, seed: int) -> tuple[float, float]:
-    """Run a method; return the mean score that it gained, and the biased objects' distance to their target."""
+    """Run a method; return its gain in mean score, and the distance of the biased objects from their target."""
     factor = Pose(bins=8, floor=0.005).factors[0]
     scene = SceneDistribution((factor,), {})
     start, target = (torch.full((6, 8), 0.125, dtype=torch.float64) for _ in range(2))

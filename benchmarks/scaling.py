@@ -1,7 +1,7 @@
-"""Seconds of the same work by one process, by several and by a Ray cluster: `python benchmarks/scaling.py fields`.
+"""Run time of the same work in one process, in several, and on a Ray cluster: `python benchmarks/scaling.py fields`.
 
-Whole commands are timed, each on a store of its own, start and imports included. Engines take turns, and the fastest
-of each one's rounds counts: other programs on the machine only ever slow a command down.
+Whole commands are timed, including start-up and imports, each on a new store. Engines take turns, and the fastest round
+of each counts, because other programs on the machine can only slow a command down.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ ROOT = Path(__file__).parents[1]
 
 @dataclass(frozen=True)
 class Case:
-    """Work that several can share.
+    """Work that several processes can share.
 
     Attributes:
         words: the command.
-        engines: what is added to it, by engine.
-        before: what is in the store already, as a command.
+        engines: overrides added to it, by engine.
+        before: command whose results are in the store beforehand.
     """
 
     words: str
@@ -78,7 +78,7 @@ def timed(words: list[str], folder: Path, database: Path) -> float:
 
 
 def main() -> None:
-    """Time a case, and print its table."""
+    """Time a case and print its table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("case", choices=CASES)
     parser.add_argument("--rounds", type=int, default=2)

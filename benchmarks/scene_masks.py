@@ -1,9 +1,10 @@
-"""Masks from the geometry of a scene against the true ones: photographs of an object on a table in a room, made here.
+"""Masks computed from the geometry of a scene, compared with true masks.
 
-Two embedded objects and, with `--root ../shared/ycb`, a scanned one; `--noise` is the deviation of the cameras' written
-positions in distances. Overlap is the intersection over union of masks above a half; PSNR is that of fields from these
-masks and from the true ones on held-out photographs, each on the foreground by its own masks. `--capture` is a folder
-of real photographs with their cameras, whose masks are compared with `--polygons`, a COCO file of some of them.
+The photographs are renders of an object on a table in a room: two embedded objects and, with `--root ../shared/ycb`, a
+scanned one. `--noise` is the standard deviation of the recorded camera positions, relative to the distance. Overlap is
+the intersection over union of masks thresholded at a half; PSNR is measured on held-out photographs for fields from
+these masks and from the true ones, each over the foreground of its own masks. `--capture` is a folder of real
+photographs with cameras instead, whose masks are compared with those in `--polygons`, a COCO file.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ HELD_OUT = 4
 
 
 def overlaps(truth: dict[str, np.ndarray], pictures: Pictures) -> dict[str, float]:
-    """Compute the overlap of each photograph's mask with the true one, where there is one, by the photograph's name."""
+    """Compute the overlap of masks with the true ones, by photograph, for photographs that have a true mask."""
     values = {}
     for frame in pictures.capture.frames:
         true = truth.get(frame.image.name)
@@ -47,7 +48,7 @@ def overlaps(truth: dict[str, np.ndarray], pictures: Pictures) -> dict[str, floa
 
 
 def polygons(file: Path) -> dict[str, np.ndarray]:
-    """Masks of a COCO file's polygons, by photograph."""
+    """Return masks from the polygons in a COCO file, by photograph."""
     coco = json.loads(file.read_text())
     drawn = {image["id"]: Image.new("L", (image["width"], image["height"])) for image in coco["images"]}
     for annotation in coco["annotations"]:
@@ -57,7 +58,7 @@ def polygons(file: Path) -> dict[str, np.ndarray]:
 
 
 def measure_real(options: argparse.Namespace) -> dict[str, float | str]:
-    """Compare a real capture's masks with polygons."""
+    """Compare the masks of a real capture with polygons."""
     source = Photos(options.capture, masks="scene", scene=SceneMasks())
     (name,) = source.names()
     spent = time.process_time()
@@ -75,19 +76,19 @@ def measure_real(options: argparse.Namespace) -> dict[str, float | str]:
 
 
 def psnr(source: Photos, name: str, pictures: Pictures, size: int) -> float:
-    """Of a field of 240 steps, on the foreground of held-out photographs."""
+    """Return the PSNR of a field fitted in 240 steps, over the foreground of held-out photographs."""
     views = source.views(name, 1000, HELD_OUT, size, pictures)
     return quick_psnr(views, len(source.split(name, 1000, HELD_OUT)[1]))
 
 
 def measure(item: ObjectMesh, options: argparse.Namespace) -> dict[str, float | str]:
-    """One object's row."""
+    """Return the table row of one object."""
     with tempfile.TemporaryDirectory() as folder:
         return measure_in(Path(folder), item, options)
 
 
 def measure_in(folder: Path, item: ObjectMesh, options: argparse.Namespace) -> dict[str, float | str]:
-    """One object's row, of photographs in a folder."""
+    """Return the table row of one object, with its photographs in a folder."""
     truth = on_a_table(
         folder, item, count=options.photos, width=options.size[0], height=options.size[1],
         exposure=0.05, pose_noise=options.noise, suffix=".jpg",
@@ -111,7 +112,7 @@ def measure_in(folder: Path, item: ObjectMesh, options: argparse.Namespace) -> d
 
 
 def main() -> None:
-    """Measure as the command line asks."""
+    """Parse the command line and run the measurements."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", help="a folder in the YCB layout, for the drill")
     parser.add_argument("--photos", type=int, default=40)

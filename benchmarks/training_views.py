@@ -1,4 +1,4 @@
-"""Views of YCB or embedded objects and fields from them, which several benchmarks share."""
+"""Views of YCB or embedded objects and fields fitted to them, shared by several benchmarks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HELD_OUT = 16
 
 
 def load_objects(root: str | None, names: list[str] | None) -> list[ObjectMesh]:
-    """Load objects of a folder in the YCB layout, or the embedded ones where ``root`` is None."""
+    """Load the objects in a folder in the YCB layout, or the embedded ones if ``root`` is None."""
     if root is None:
         return Procedural(names, 0).load()
     return YCB(root, [*(names or PAPER_OBJECTS)]).load()
@@ -38,7 +38,7 @@ def training_views(item: ObjectMesh, size: int, count: int) -> PosedViews:
 
 
 def fit(views: PosedViews, steps: int) -> RadianceField:
-    """Fit a field with the default settings, its structure's steps in proportion to the budget."""
+    """Fit a field with default settings, scaling the steps at which its structure changes with the budget."""
     refine, pruned = (steps // 6, steps // 2), (2 * steps // 3, 5 * steps // 6)
     fitting = GridFitting(GridField(), refine_steps=refine, prune_steps=pruned)
     generator = torch.Generator().manual_seed(0)
@@ -46,7 +46,7 @@ def fit(views: PosedViews, steps: int) -> RadianceField:
 
 
 def quick_psnr(views: PosedViews, held_out: int = HELD_OUT) -> float:
-    """Return the PSNR (dB) on the foreground of held-out views of a field that is fitted as at quick scale."""
+    """Return the PSNR in dB, over the foreground of held-out views, of a field fitted as in scale=quick."""
     fitting = GridFitting(GridField(), resolution=128, refine_steps=(80,), prune_steps=(160,))
     generator = torch.Generator().manual_seed(0)
     return fit_field(views, fitting, generator, steps=240, held_out=held_out)[1][-1]["psnr_foreground"]
