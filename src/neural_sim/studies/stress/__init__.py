@@ -1,1 +1,1 @@
-"""Stiff and extreme cases, each with a tolerance from theory or from a float64 reference."""
+"""Stiff and extreme cases, each checked with a tolerance from theory or against a float64 reference."""

@@ -1,4 +1,4 @@
-"""What a case of the stress suite is given, and what it yields."""
+"""Inputs and outputs of the cases of the stress suite."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 FALSE_ALARM = 1e-9
-"""Probability with which a statistical check may fail where the code is right."""
+"""Largest probability with which a statistical check fails although the code is right."""
 DOUBLE, SINGLE = torch.float64, torch.float32
 
 
 @dataclass(frozen=True)
 class Scope:
-    """What every case is given: the seed of its random problems, and whether heavy ones run at full size.
+    """Input of every case: the seed of its random problems, and whether heavy ones run at full size.
 
-    Tolerances hold for every seed; statistical ones fail with probability below ``FALSE_ALARM`` each.
+    Tolerances are valid for every seed; each statistical check fails with probability below ``FALSE_ALARM``.
     """
 
     seed: int = 0
@@ -36,11 +36,10 @@ class Scope:
 
 @dataclass(frozen=True)
 class Check:
-    """One number compared with its bound: passes where ``value <= tolerance`` and the status is a wanted one.
+    """One number compared with its bound: passes if ``value <= tolerance`` and the status is a wanted one.
 
-    ``value`` is an error (0 is perfect), ``tolerance`` what theory allows it, ``wanted`` the statuses that are right
-    here (empty: the quantity has none). NaN never passes. The suite adds the case and the ``seconds`` that led to the
-    value.
+    ``value`` is an error (0 is perfect), ``tolerance`` the error that theory allows, ``wanted`` the correct statuses
+    (empty: the quantity has none). NaN never passes. The suite adds the case and the ``seconds`` it took.
     """
 
     quantity: str
@@ -58,13 +57,13 @@ class Check:
 
     @property
     def used(self) -> float:
-        """Part of the tolerance that the value uses up; above 1 the check has failed."""
+        """Fraction of the tolerance that the value uses up; above 1 the check has failed."""
         if self.value == 0.0:
             return 0.0
         return self.value / self.tolerance if self.tolerance > 0.0 else math.inf
 
     def record(self) -> dict[str, Any]:
-        """Return the check as JSON; a number that does not exist is null."""
+        """Return the check as JSON; undefined numbers are null."""
         values = {key: value for key, value in asdict(self).items() if key != "wanted"}
         numbers = {key: None for key in ("value", "tolerance") if not math.isfinite(values[key])}
         return {**values, **numbers, "passed": self.passed}
@@ -76,7 +75,7 @@ CASES: dict[str, Callable[[Scope], Checks]] = {}
 
 
 def case(function: Callable[[Scope], Checks]) -> Callable[[Scope], Checks]:
-    """Register a case under the name of its file and its own."""
+    """Register a case under the names of its file and its function."""
     CASES[f"{function.__module__.rsplit('.', 1)[-1]}/{function.__name__}"] = function
     return function
 
@@ -87,7 +86,7 @@ def eps(dtype: torch.dtype) -> float:
 
 
 def worst(*tensors: Tensor) -> float:
-    """Return the largest size of any entry; NaN where there is one."""
+    """Return the largest absolute value of any entry; NaN if there is a NaN."""
     return max((float(tensor.detach().abs().max()) for tensor in tensors), key=lambda v: (math.isnan(v), v))
 
 
@@ -97,5 +96,5 @@ def not_finite(*tensors: Tensor) -> float:
 
 
 def short(dtype: torch.dtype) -> str:
-    """Return a type's name without its module."""
+    """Return the name of a type without its module."""
     return str(dtype).removeprefix("torch.")

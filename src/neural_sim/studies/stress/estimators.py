@@ -30,9 +30,9 @@ def _peaked(depth: float) -> Tensor:
 
 @case
 def constant_scores(scope: Scope) -> Checks:
-    """Estimate from equal scores: no bin is better, and the derivative is 0 exactly.
+    """Estimate from equal scores: no bin is better, and the derivative is exactly 0.
 
-    The rounding of a sum would not do: an update that takes out the gradient's scale would turn it into a full step.
+    Even rounding errors are not allowed: an update that normalises the gradient would turn them into a full step.
     """
     for value in (1.0, 0.1, -1e8, 1e-300, 1e100):
         scores = torch.full((len(KNOWN),), value, dtype=DOUBLE)
@@ -51,9 +51,9 @@ def constant_scores(scope: Scope) -> Checks:
 
 @case
 def score_scales(scope: Scope) -> Checks:
-    """Estimate from scores in another unit, by powers of two: the derivative changes by that, and no digit of it.
+    """Estimate from scores scaled by powers of two: the derivative scales exactly, without changing a digit.
 
-    An offset common to all scores changes nothing but by its rounding, n eps of the offset.
+    An offset common to all scores changes the derivative only by rounding, n eps times the offset.
     """
     table, psi = scope.normal(BINS, EACH), scope.normal(BINS)
     plain = stratified(table, psi, _floored)
@@ -72,10 +72,10 @@ def score_scales(scope: Scope) -> Checks:
 
 @case
 def significance(scope: Scope) -> Checks:
-    """Take p-values in another unit, by powers of two: no digit changes.
+    """Compute p-values of data scaled by powers of two: no digit changes.
 
-    Scores that are all equal, one image, one row other than zero, numbers that are not finite: 1, nothing is told. Bins
-    of one image each: every permutation has the same statistic, and the p-value is 1.
+    The p-value is 1 if the data say nothing: equal scores, one image, a single nonzero row, or numbers that are not
+    finite. It is also 1 with one image per bin, since every permutation has the same statistic.
     """
     bins = torch.eye(BINS, dtype=DOUBLE).repeat_interleave(EACH, 0)
     scores, rows = scope.normal(len(bins)), scope.normal(len(bins), BINS)
@@ -102,7 +102,7 @@ def significance(scope: Scope) -> Checks:
 
 @case
 def one_hot(scope: Scope) -> Checks:
-    """Estimate at p from uniform to one-hot: the closed form p_i (s_i - sum_j p_j s_j)."""
+    """Estimate at p from uniform to one-hot, and compare with the closed form p_i (s_i - sum_j p_j s_j)."""
     table = scope.normal(BINS, EACH)
     means = table.mean(-1)
     for depth in (0.0, 20.0, 1000.0):

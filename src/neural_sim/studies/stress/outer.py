@@ -1,4 +1,4 @@
-"""Stiff outer dynamics: the steps of psi at any learning rate, from gradients of any size, and the loop around them."""
+"""Stiff outer dynamics: steps in psi at any learning rate and gradient size, and the loop around them."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ RATES = (1e-6, 1e-3, 1.0, 1e3)
 
 @dataclass
 class Worst:
-    """The worst seen over a run: numbers not finite, steps beyond their bound, p off the simplex or below its floor."""
+    """The worst violations in a run: numbers not finite, steps beyond their bound, p off the simplex or the floor."""
 
     not_finite: float = 0.0
     excess: float = 0.0
     off_simplex: float = 0.0
 
     def see(self, before: Tensor, after: Tensor) -> None:
-        """Take a step into account."""
+        """Record the violations of one step."""
         self.not_finite += not_finite(after)
         # psi + step and its difference round by eps |psi| each.
         excess = (after - before).abs() - MAX_STEP - 2 * eps(DOUBLE) * after.abs()
@@ -61,7 +61,7 @@ class Worst:
         self.off_simplex = max(self.off_simplex, below, float((p.sum(-1) - 1.0).abs().max()))
 
     def checks(self, label: str, status: str = "", wanted: tuple[str, ...] = ()) -> Checks:
-        """Check all that was seen."""
+        """Yield checks of all recorded violations."""
         yield Check(f"psi not finite: {label}", self.not_finite, 0.0, status, wanted)
         yield Check(f"step beyond max_step: {label}", self.excess, 8 * eps(DOUBLE) * MAX_STEP)
         # log p carries eps |psi| of the softmax part (at most 30 nats of it show beside the floor) and k roundings.
@@ -78,7 +78,7 @@ def slope(psi: Tensor, costs: Tensor) -> Tensor:
 def run(
     update: Update, psi: Tensor, gradients: Iterable[Callable[[Tensor], Tensor]], error: float, worst: Worst
 ) -> UpdateState:
-    """Step along gradients that depend on psi, with standard errors of a part ``error`` of them."""
+    """Step along gradients that depend on psi, with standard errors of a fraction ``error`` of their size."""
     state = UpdateState.zeros(psi)
     for of in gradients:
         gradient = of(psi)
@@ -91,10 +91,10 @@ def run(
 
 @case
 def learning_rates(scope: Scope) -> Checks:
-    """Step at rates from 1e-6 to 1e3 on noisy costs of 1e-6, 1 and 1e6 (one scale an object).
+    """Step at rates from 1e-6 to 1e3 on noisy costs of 1e-6, 1 and 1e6 (one scale per object).
 
-    From uniform p and from bins 1000 nats below: at every step psi is finite, p on its simplex and the step at most
-    ``max_step``, which ``bound`` promises.
+    Runs start from uniform p and from bins 1000 nats below. At every step psi must be finite, p on its simplex and the
+    step at most ``max_step``, as ``bound`` promises.
     """
     steps = 300 if scope.full else 40
     costs = scope.normal(3, 8) * torch.tensor([[1e-6], [1.0], [1e6]], dtype=DOUBLE)
@@ -113,7 +113,7 @@ def learning_rates(scope: Scope) -> Checks:
 
 @case
 def flat_loss(scope: Scope) -> Checks:
-    """Step along a gradient of exactly zero, by any update, rate and psi: no digit changes."""
+    """Step along a gradient of exactly zero, with any update, rate and psi: no digit changes."""
     for name, make in UPDATES.items():
         for rate in RATES:
             moved = 0.0
@@ -129,11 +129,11 @@ def flat_loss(scope: Scope) -> Checks:
 
 @case
 def cliff(scope: Scope) -> Checks:
-    """Step along one gradient of 1e30 and above, infinite or NaN, between usual ones.
+    """Step along a single gradient of 1e30 or more, infinity or NaN, among normal ones.
 
-    The step is bounded, or refused and counted, and psi stays finite and bounded in the 30 steps after it. Up to 1e100
-    every square is finite and the step is taken; inf and NaN are refused; between, where squares overflow, either is
-    right.
+    The step must be bounded, or refused and counted, and psi must stay finite and bounded in the next 30 steps. Up to
+    1e100 squares are finite and the step is taken; inf and NaN are refused; in between, squares overflow and either is
+    correct.
     """
     costs, shape = scope.normal(3, 8), scope.normal(3, 8)
     for name, make in UPDATES.items():
@@ -157,24 +157,24 @@ def cliff(scope: Scope) -> Checks:
 
 @dataclass(frozen=True)
 class Constant:
-    """An estimator that returns one number for everything."""
+    """An estimator that always returns the same number."""
 
     value: float
     draws: ClassVar[HardDraws] = HardDraws()
     probes_per_bin: ClassVar[int] = 0
 
     def estimate(self, losses: Any, params: Any, vector: Any, images: Any, probes: Any) -> MixedDerivative:
-        """Return the number, tilted over the bins."""
+        """Return the number, with a slope over the bins."""
         shape = torch.linspace(-1.0, 1.0, images.psi.numel(), dtype=images.psi.dtype)
         return MixedDerivative(self.value * shape, torch.zeros_like(shape))
 
 
 @case
 def loop(scope: Scope) -> Checks:
-    """Run the whole psi loop on a cube of 4 bins whose estimator returns NaN, inf, 1e30 or 0.
+    """Run the whole psi loop on a cube with 4 bins and an estimator that returns NaN, inf, 1e30 or 0.
 
-    psi is finite and within the bound of its steps, a gradient that is not finite moves nothing and its certificate
-    says what was done, zero moves nothing.
+    Psi must be finite and within the bound of its steps. Zero and gradients that are not finite must not move psi, and
+    the certificate of the latter must say what was done.
     """
     iterations = 2
     actions = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}

@@ -1,11 +1,11 @@
-"""Rendering at the ends of density, size and distance, against Beer and Lambert's law along a closed-form chord.
+"""Rendering at extremes of density, size and distance, against the Beer-Lambert law along a closed-form chord.
 
-Constant density s over a ray's length L gives the opacity 1 - exp(-s L). The grid takes one sample a step h of a fixed
-lattice, so that it sees N h with |N h - L| <= h for every interval that the ray spends inside: the opacity lies between
-those of L - h and L + h, and N h = L where the interval's ends are h apart on the lattice. Rounding: a table entry r
-(log of the density where that is small) is known to eps |r|, a sum of N terms to N eps, relatively in the optical depth
-and hence at most as much in the opacity. The running sum over all rays' samples is known to N eps of float64 times the
-sum of their optical depths, of which one counts for 50 at most.
+Constant density s over a length L of a ray gives the opacity 1 - exp(-s L). The grid takes one sample per step h of a
+fixed lattice, so that it sees a length N h with |N h - L| <= h for every interval inside the object: the opacity lies
+between those of L - h and L + h, and N h = L if the ends of the interval are on the lattice. Rounding: a table entry r
+(the log of a small density) is accurate to eps |r| and a sum of N terms to N eps, relative to the optical depth; the
+error of the opacity is no larger. The running sum over the samples of all rays is accurate to N eps of float64 times
+the sum of their optical depths, each of which counts for at most 50.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DENSITIES = (0.0, 1e-6, 1e-3, 1.0, 1e3, 1e8)
 
 @case
 def slab_opacity(scope: Scope) -> Checks:
-    """Render densities from 0 to 1e8 through a cube of edge 2 on the lattice: 1 - exp(-2 s), relatively."""
+    """Render densities from 0 to 1e8 through a cube of edge 2 on the lattice, against 1 - exp(-2 s), relatively."""
     for dtype in (DOUBLE, SINGLE):
         for sigma in DENSITIES:
             rgb, opacity = EXACT.render_rays(block(sigma, dtype), along_x((0.1, 0.2), dtype=dtype))
@@ -48,11 +48,11 @@ def slab_opacity(scope: Scope) -> Checks:
 
 @case
 def ball_opacity(scope: Scope) -> Checks:
-    """Render the unit sphere by the network, whose samples partition a ray's chord whatever the density.
+    """Render the unit sphere with the network, whose samples partition the chord of a ray whatever the density.
 
-    Rays come from outside, from inside and almost tangent. Rounding: the near and far ends to a few eps of the
-    distance, which half a chord of 1e-3 takes up 1e3-fold through the square root, and 192 widths; and the running
-    sum's.
+    Rays start outside, start inside, or are almost tangent. Rounding: the near and far ends are accurate to a few eps
+    of the distance, which the square root magnifies 1e3-fold for half a chord of 1e-3; 192 widths and the running sum
+    add theirs.
     """
     distances = torch.tensor([0.0, 0.5, 0.999, 1.0 - 5e-7, 1.001], dtype=DOUBLE)
     half = (1.0 - distances.square()).clamp_min(0.0).sqrt()
@@ -71,10 +71,10 @@ def ball_opacity(scope: Scope) -> Checks:
 
 @case
 def mixed_densities(scope: Scope) -> Checks:
-    """Composite a faint ray behind a thousand opaque ones in the same pack.
+    """Composite a faint ray packed after a thousand opaque ones.
 
-    Its opacity is 1 - exp(-0.5) for each density of the others, to the rounding of the running sum and of the ray's own
-    20 samples.
+    Its opacity is 1 - exp(-0.5) whatever the density of the others, up to rounding of the running sum and of its own 20
+    samples.
     """
     rays, each, width = 1001, 20, 0.05
     for dtype in (DOUBLE, SINGLE):
@@ -95,9 +95,9 @@ def mixed_densities(scope: Scope) -> Checks:
 def thin_shell(scope: Scope) -> Checks:
     """Render walls half as thick as a step.
 
-    A lattice may miss one, but over 64 equally spaced phases of the lattice the mean of N h is that of a lattice 64
-    times as fine: within h / 64 of each wall's length. At one phase it is within h of each, and at the default step,
-    one cell, no wall that a ray crosses fully is missed.
+    A lattice may miss a wall, but the mean of N h over 64 equally spaced phases is that of a lattice 64 times as fine:
+    within h / 64 of the length in each wall. At a single phase it is within h, and at the default step of one cell no
+    wall is missed that a ray crosses fully.
     """
     half, cells, phases = 1.0, 8, 64
     targets = 0.7 * (2 * torch.rand(300, 3, generator=scope.generator(), dtype=DOUBLE) - 1.0)
@@ -123,7 +123,7 @@ def thin_shell(scope: Scope) -> Checks:
 
 @case
 def camera_inside(scope: Scope) -> Checks:
-    """Render from within the cube: the length to its wall, within a step; the early end errs by 1e-3 at most."""
+    """Render from inside the cube: correct within a step of the distance to its wall; early termination adds 1e-3."""
     for dtype in (DOUBLE, SINGLE):
         origins = (1.8 * torch.rand(500, 3, generator=scope.generator(), dtype=DOUBLE) - 0.9).to(dtype)
         rays = Rays(origins, torch.nn.functional.normalize(scope.normal(500, 3).to(dtype), dim=-1))
@@ -140,10 +140,10 @@ def camera_inside(scope: Scope) -> Checks:
 
 @case
 def grazing_rays(scope: Scope) -> Checks:
-    """Render rays almost in the plane of a face, by closed form and a step.
+    """Render rays almost in the plane of a face, against the closed form within a step.
 
-    On planes between cells no cell counts twice or not at all; in the very plane of a face either side is right. Rays
-    past the object and away from it see exactly 0, with derivatives that are exactly 0.
+    On planes between cells every cell counts exactly once; exactly in the plane of a face either side is correct. Rays
+    that miss the object see exactly 0, with derivatives of exactly 0.
     """
     slopes = (0.0, 1e-12, -1e-12, 1e-9, -1e-9, 1e-6, -1e-6, 1e-3, -1e-3)
     pairs = [(gap, slope) for gap in (1e-3, 1e-2, -1e-3) for slope in slopes]

@@ -1,4 +1,4 @@
-"""Draws from p_psi at the ends of their settings, against closed forms."""
+"""Draws from p_psi at extreme settings, against closed forms."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CAP = 0.1
 
 
 def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
-    """Return the deviation of a frequency in ``draws`` from p, exceeded with probability ``alarm`` (Bernstein)."""
+    """Return the bound that a frequency's deviation from p exceeds with probability ``alarm`` at most (Bernstein)."""
     logarithm = math.log(2.0 / alarm)
     linear = logarithm / (3.0 * draws)
     return linear + (linear**2 + 2.0 * p * (1.0 - p) * logarithm / draws).sqrt()
@@ -41,8 +41,8 @@ def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
 def one_hot(scope: Scope) -> Checks:
     """Draw from psi = 1000 on one bin without a floor.
 
-    p is 1 there to the last bit, log p elsewhere is -1000 to a few roundings, every draw is of that bin (Gumbel noise
-    spans 31 at most), and dp/dpsi = p (1 - p) = exp(-1000) underflows to 0.
+    There p is exactly 1, log p elsewhere is -1000 up to a few roundings, every draw is from that bin (Gumbel noise
+    spans at most 31), and dp/dpsi = p (1 - p) = exp(-1000) underflows to 0.
     """
     scene = SceneDistribution.of([Pose(floor=0.0)])
     (pose,) = scene.binned
@@ -68,7 +68,7 @@ def one_hot(scope: Scope) -> Checks:
 
 @case
 def floor(scope: Scope) -> Checks:
-    """Take p of psi far below: (1 - k f) softmax(psi) + f.
+    """Compute p for very negative psi, against (1 - k f) softmax(psi) + f.
 
     The derivative of log p_i is (1 - k f) s_i (1 - s_i) / p_i. Rounding: log_softmax of entries of size up to |psi|
     costs eps |psi| in the exponent, the sum in logaddexp a few eps more. At psi = -800 the derivative is 0 and p is f
@@ -136,9 +136,9 @@ def temperatures(scope: Scope) -> Checks:
 
 @case
 def gumbel_max(scope: Scope) -> Checks:
-    """Count drawn bins against p, by Bernstein's inequality over all bins, for hard and relaxed draws at every tau.
+    """Compare frequencies of drawn bins with p by Bernstein's inequality, for hard and relaxed draws at every tau.
 
-    The noise is finite where it is drawn for (float64, float32, float16, bfloat16).
+    The noise is finite in every precision that it is drawn for (float64, float32, float16, bfloat16).
     """
     draws = 200_000 if scope.full else 20_000
     for count in (1, 2, 8, 64):
