@@ -1,6 +1,6 @@
-"""Whole images at the ends of size, distance and precision; boxes of a pixel and of the image, as detectors learn them.
+"""Whole images at extremes of size, distance and precision, and detector targets from a one-pixel box to a whole image.
 
-Truths are the geometry of the pinhole, and the rounding of 8 bits.
+References are pinhole geometry and the rounding of 8 bits.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def beside(distance: float) -> Tensor:
 
 
 def boxed(label: str, opacity: Tensor, expected: list[float], margin: float, wanted: str = "BOX") -> Check:
-    """Check the box round what is opaque."""
+    """Check the box around the opaque pixels."""
     boxes, present = boxes_from_opacity(opacity)
     status = "BOX" if bool(present[0]) else "NO_BOX"
     return Check(f"box: {label}", worst(boxes[0, 0] - torch.tensor(expected)), margin, status, (wanted,))
@@ -52,7 +52,7 @@ def boxed(label: str, opacity: Tensor, expected: list[float], margin: float, wan
 def one_pixel_object(scope: Scope) -> Checks:
     """Render an object of half a pixel in front of the middle pixel of 33: exactly one pixel, a box of 1 x 1.
 
-    Between four pixels of 32 no ray meets it, and there is no box.
+    Centred between four pixels of an image of 32, it is missed by every ray, and there is no box.
     """
     field = block(OPAQUE, half=0.1)
     for size, expected, wanted in ((33, [16.0, 16.0, 17.0, 17.0], "BOX"), (32, [0.0] * 4, "NO_BOX")):
@@ -92,7 +92,7 @@ def wide_object(scope: Scope) -> Checks:
 def zoom_ends(scope: Scope) -> Checks:
     """Draw and render both ends of the distance, from just outside the unit sphere to 1e5 radii.
 
-    A point at distance D is known to 2 eps D, so that the chord of a ray is known to 4 eps D and a step.
+    A point at distance D is accurate to 2 eps D, so the chord of a ray is accurate to 4 eps D and a step.
     """
     for ends in ((2.4, 4.0), (1.0 + 1e-6, 1e5)):
         scene = SceneDistribution.of([Pose()], Unlearned(distance=ends))
@@ -152,10 +152,10 @@ def bfloat16(scope: Scope) -> Checks:
 
 @case
 def extreme_boxes(scope: Scope) -> Checks:
-    """Assign boxes of one pixel, of the whole image, at its corner, and a sliver.
+    """Assign anchors to a box of one pixel, of the whole image, at its corner, and to a sliver.
 
-    Each claims the anchor that overlaps it most (low quality matches), its code decodes to the box itself, and loss and
-    gradient are finite; also without any box, where every anchor is background.
+    Each box gets the anchor that overlaps it most (low-quality matches), its encoding decodes to the same box, and loss
+    and gradient are finite. So they are without any box, when every anchor is background.
     """
     side = 32.0
     network = small_detector(3)

@@ -1,4 +1,4 @@
-"""Inner problems far from stationary, flat, indefinite or of any unit, where the implicit derivative is known."""
+"""Inner problems with a known implicit derivative: far from stationary, flat, indefinite, or in other units."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ class Quadratic:
 
     @property
     def hessian(self) -> Tensor:
-        """The second derivative of L_train, without the unit."""
+        """The Hessian of L_train divided by the unit s."""
         return self.a.T @ self.a / ROWS + self.damping * torch.eye(SIZE, dtype=DOUBLE)
 
     @property
     def minimiser(self) -> Tensor:
-        """L_train's, at psi = 0."""
+        """The minimiser of L_train at psi = 0."""
         return torch.linalg.solve(self.hessian, self.a.T @ self.c / ROWS)
 
     def implicit(self, theta: Tensor) -> Tensor:
@@ -70,7 +70,7 @@ class Quadratic:
         return self.d.T @ self.a @ torch.linalg.solve(self.hessian, slope) / ROWS
 
     def solved(self, theta: Tensor, solver: LinearSolver, rtol: float) -> Hypergradient[ImplicitAdjoint]:
-        """Solve by the project's own code, with the proximal term as damping."""
+        """Solve with the code under test, using the proximal term as damping."""
         params = {"w": theta[:2].clone(), "v": theta[2:].clone()}
         weights = torch.full((ROWS,), self.unit / ROWS, dtype=DOUBLE)
         anchor = {name: torch.zeros_like(value) for name, value in params.items()}
@@ -122,7 +122,7 @@ def far_from_stationary(scope: Scope) -> Checks:
 
 @case
 def units(scope: Scope) -> Checks:
-    """Solve with L_train in another unit, which leaves dL_val/dpsi as it is; powers of two change no digit."""
+    """Solve with L_train in another unit, which does not affect dL_val/dpsi; powers of two change no digit."""
     problem = Quadratic.random(scope)
     plain = problem.solved(problem.minimiser, ConjugateGradient(), 1e-10)
     for power in (-200, -60, 60, 200):
@@ -136,8 +136,8 @@ def units(scope: Scope) -> Checks:
 def degenerate(scope: Scope) -> Checks:
     """Solve flat inner problems, and losses that are NaN or overflow.
 
-    A flat one without damping has no inverse: v = 0 and a status; with lambda, v = b / lambda. A loss that is NaN or
-    overflows has a status and v = 0.
+    A flat problem without damping has no inverse: v must be 0, with a status; with lambda, v = b / lambda. For a loss
+    that is NaN or overflows, v must be 0, with a status.
     """
     b = scope.normal(SIZE)
     params = {"x": torch.ones(SIZE, dtype=DOUBLE)}

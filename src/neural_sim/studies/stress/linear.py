@@ -2,7 +2,7 @@
 
 Notation: n unknowns, condition number k = |A| |A^-1|, eps of the arithmetic. A backward stable solver leaves a residual
 of at most n^2 eps |A| |x| (the worst-case constant of a dense factorisation; Higham, Accuracy and Stability, Thm.
-10.4), and ``|x - x*| <= |A^-1| |r|`` whatever the solver. More may not be asked of any of them.
+10.4), and ``|x - x*| <= |A^-1| |r|`` whatever the solver. No solver can be expected to do better.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class System:
 
     @property
     def lift(self) -> float:
-        """|A| |x| / |b|: what a backward error is multiplied by in the relative residual; from 1 to k."""
+        """|A| |x| / |b|, the factor from backward error to relative residual; between 1 and k."""
         return float(self.values.abs().max() * self.x.norm() / self.b.norm())
 
     def rounded(self) -> System:
-        """Return the system in float32, with the float64 solution of what that stores."""
+        """Return the system rounded to float32, with the float64 solution of the rounded system."""
         matrix, b = self.matrix.float(), self.b.float()
         truth = torch.linalg.solve(matrix.double(), b.double())
         return System(matrix, self.basis, self.values, truth, b)
@@ -89,17 +89,17 @@ def relative(value: Tensor, truth: Tensor) -> float:
 
 
 def backward_error(dtype: torch.dtype = DOUBLE) -> float:
-    """Return n^2 eps, what a backward stable solver may leave."""
+    """Return n^2 eps, the backward error allowed to a stable solver."""
     return SIZE**2 * eps(dtype)
 
 
 def krylov_steps(condition: float, rtol: float) -> int:
-    """Return steps within which CG and MINRES must have converged: twice the Chebyshev bound."""
+    """Return the number of steps in which CG and MINRES must converge: twice the Chebyshev bound."""
     return math.ceil(math.sqrt(condition) * math.log(2.0 * math.sqrt(condition) / rtol)) + 2 * SIZE
 
 
 def ended(quantity: str, value: float, tolerance: float, solution: Solution, *wanted: Status) -> Check:
-    """Check a solve, which must have ended as ``wanted`` says (converged)."""
+    """Check a solve, whose status must be one of ``wanted`` (default: converged)."""
     names = tuple(status.name for status in wanted or (Status.CONVERGED,))
     return Check(quantity, value, tolerance, solution.status.name, names)
 
@@ -156,7 +156,7 @@ def indefinite(scope: Scope) -> Checks:
             problem = system(sign * logarithmic(condition), generator)
             rtol = backward_error() * problem.lift
             for name in SOLVERS:
-                # On a spectrum of both signs k stands where sqrt(k) does on a definite one.
+                # On an indefinite spectrum the bound has k in place of sqrt(k).
                 solution = problem.solve(ALL[name], rtol, krylov_steps(condition**2, rtol))
                 quantity = f"{name}, {label}, condition {condition:.0e}"
                 if name in ("minres", "exact"):

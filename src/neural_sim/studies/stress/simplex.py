@@ -1,4 +1,4 @@
-"""Weights on the simplex (what illumination learns), against an exact solution in rational arithmetic."""
+"""Projection onto the simplex, for weights of lights, against an exact solution in rational arithmetic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cases render and train: a cube and a ball of constant density, their closed forms, and a small detector."""
+"""Subjects of the cases: a cube and a ball of constant density with closed forms, and a small detector."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def block(
     sigma: float, dtype: torch.dtype = SINGLE, half: float = 1.0, cells: int = 8, step_cells: float = 1.0,
     colour: float = 0.0, hollow: bool = False,
 ) -> GridField:  # fmt: skip
-    """Make a cube of constant density round the origin; ``hollow`` leaves only its outermost cells."""
+    """Make a cube of constant density around the origin; with ``hollow``, only its outermost cells are filled."""
     field = GridField(step_cells=step_cells, density_gain=1.0).to(dtype)
     occupied = torch.ones(cells, cells, cells, dtype=torch.bool)
     if hollow:
@@ -42,7 +42,7 @@ def block(
 
 
 def ball(sigma: float, dtype: torch.dtype = SINGLE) -> MLPField:
-    """Make the network with all weights zero: constant density in the unit sphere."""
+    """Make a network with zero weights, which gives constant density in the unit sphere."""
     scale = 1.0 if sigma == 0.0 else sigma
     field = MLPField(
         width=4, depth=2, position_frequencies=1, direction_frequencies=1, density_scale=scale
@@ -69,23 +69,23 @@ def chord(rays: Rays, half: float) -> Tensor:
 
 
 def opacity_of(depth: Tensor | float) -> Tensor:
-    """Return the opacity of an optical depth, by Beer and Lambert's law."""
+    """Return the opacity for an optical depth, by the Beer-Lambert law."""
     return -torch.expm1(-torch.as_tensor(depth, dtype=DOUBLE).clamp_min(0.0))
 
 
 def outside(opacity: Tensor, sigma: float, shortest: Tensor, longest: Tensor) -> float:
-    """Return how far opacities lie outside those of lengths from ``shortest`` to ``longest``."""
+    """Return by how much opacities leave the range for lengths from ``shortest`` to ``longest``."""
     low, high = opacity_of(sigma * shortest), opacity_of(sigma * longest)
     return float(torch.maximum(low - opacity.double(), opacity.double() - high).clamp_min(0.0).max())
 
 
 def rounding_of(sigma: float, dtype: torch.dtype, cell: float = 0.25) -> float:
-    """Return what the table's entry and a ray's sum of samples may round an opacity by."""
+    """Return a bound on the rounding error of an opacity, from the table entry and the sum over samples of a ray."""
     return (abs(raw_density(sigma, cell)) + 32) * eps(dtype) if sigma else 0.0
 
 
 def running_sum(samples: int, depth: float) -> float:
-    """Return what the running sum over a pack may lose, for the sum of optical depths of all its samples."""
+    """Return a bound on the rounding error of a running sum of optical depths over all samples of a pack."""
     return samples * eps(DOUBLE) * (min(depth, 50.0 * samples) + samples)
 
 

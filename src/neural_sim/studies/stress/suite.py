@@ -1,4 +1,4 @@
-"""``+experiment=stress``: runs families of stiff and extreme cases one after another, and says what failed."""
+"""``+experiment=stress``: run families of stiff and extreme cases one after another, and report failures."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from neural_sim.tasks.context import Context, Task, TaskFailure
 
 Family = Literal["linear", "inner", "estimators", "sampling", "simplex", "rendering", "imaging", "outer"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
-"""One file each, in the order of the loop: its cases are the functions marked ``@case``."""
+"""Families, one file each, in the order of the psi loop; their cases are the functions marked ``@case``."""
 
 
 @validated
 @dataclass(frozen=True)
 class Stress(Task):
-    """Run every case of ``families``; ``full`` False takes smaller versions of the heavy ones."""
+    """Run every case of ``families``; without ``full``, in smaller versions of the heavy ones."""
 
     families: Annotated[Sequence[Family], MinLen(1)] = FAMILIES
     full: bool = True
@@ -36,7 +36,7 @@ class Stress(Task):
         """Run and publish every check.
 
         Raises:
-            TaskFailure: a check failed, when all is written.
+            TaskFailure: a check failed; raised after everything has been written.
         """
         checks = self.run_all(context.config["seed"], context.config["progress"])
         write_whole(context.folder / "stress.md", markdown(checks))
@@ -47,7 +47,7 @@ class Stress(Task):
             raise TaskFailure(f"stress: {len(failed)} checks failed")
 
     def run_all(self, seed: int, progress: bool = False) -> list[Check]:
-        """Run all checks; a case that fails or raises does not keep the others from running."""
+        """Run all checks; a case that fails or raises does not stop the others."""
         for family in self.families:
             importlib.import_module(f"{__package__}.{family}")
         names = [name for family in self.families for name in CASES if name.split("/")[0] == family]
@@ -57,7 +57,7 @@ class Stress(Task):
 
 
 def run_case(name: str, scope: Scope) -> Checks:
-    """Yield a case's checks as they come; one that raises, or checks nothing, has failed."""
+    """Yield the checks of a case as they come; a case that raises, or checks nothing, has failed."""
     checks, count = CASES[name](scope), 0
     while True:
         begin, ended = time.perf_counter(), True
@@ -77,7 +77,7 @@ def run_case(name: str, scope: Scope) -> Checks:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep warnings out of the log: the cases provoke them, and statuses are what they check."""
+    """Keep warnings out of the log, since cases provoke them and check statuses instead."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -99,7 +99,7 @@ def _by_case(checks: Sequence[Check]) -> dict[str, list[Check]]:
 
 
 def metrics(checks: Sequence[Check]) -> dict[str, float]:
-    """Return what MLflow keeps: counts, and of each case failures, the part of a tolerance used up, and seconds."""
+    """Return MLflow metrics: counts, and for each case failures, largest fraction of a tolerance used, and seconds."""
     found = {"checks": float(len(checks)), "failed": float(len(failures(checks)))}
     for name, own in _by_case(checks).items():
         found |= {
@@ -111,7 +111,7 @@ def metrics(checks: Sequence[Check]) -> dict[str, float]:
 
 
 def table(checks: Sequence[Check]) -> str:
-    """Return a line a case (checks, the largest part of a tolerance used up, seconds), then what failed."""
+    """Return one line per case (checks, largest fraction of a tolerance used, seconds), then the failures."""
     lines = [f"{'case':<38}{'checks':>7}{'failed':>7}{'used':>9}{'seconds':>9}"]
     for name, own in _by_case(checks).items():
         used = max(check.used for check in own)

@@ -1,4 +1,4 @@
-"""What a run gives to the families of measurements: its fields, detector and psi loop, from the store or made now."""
+"""Inputs of the families of measurements: fields, detector and psi loop of a run, from the store or made on demand."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from neural_sim.types import PosedViews
 
 @dataclass(frozen=True)
 class World:
-    """The parts of a run, each made when it is first asked for."""
+    """The parts of a run, each made on first use."""
 
     context: Context
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The objects' names."""
+        """The names of the objects."""
         return self.context.graph.names
 
     @property
@@ -45,12 +45,12 @@ class World:
 
     @property
     def held_out(self) -> int:
-        """How many of the views are held out."""
+        """The number of held-out views."""
         return self.context.experiment.imaging.views.held_out
 
     @property
     def renderer(self) -> NerfRenderer:
-        """The run's own."""
+        """The renderer of the run."""
         return self.context.experiment.imaging.renderer
 
     @property
@@ -77,7 +77,7 @@ class World:
 
     @property
     def visited(self) -> Mapping[str, Psi]:
-        """Where the psi loop came after its first step that moved psi, and where it ended; empty if none did."""
+        """Psi after the first step that moved it, and at the end of the loop; empty if no step moved it."""
         trajectory = self.context.results(self.context.graph.learned).trajectory
         moved = [psi for psi in trajectory if not torch.equal(psi, trajectory[0])]
         return {"first_step": moved[0], "end": trajectory[-1]} if moved else {}
@@ -85,10 +85,10 @@ class World:
     def simulator(
         self, outer: Outer, solver: AdjointSolver, seed: int, psi: Psi | None = None
     ) -> SimulatorModule:
-        """Return the psi loop, not yet run, with other settings and at another ``psi`` than its first.
+        """Return the psi loop, not yet run, with other settings and starting from another ``psi``.
 
         Raises:
-            ValueError: a method that does not follow the hypergradient.
+            ValueError: the method does not follow the hypergradient.
         """
         stage = self.context.graph.learned
         if stage.parts is None:
