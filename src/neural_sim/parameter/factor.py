@@ -95,7 +95,7 @@ class Factor(Protocol):
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What hard draws at a given ``p`` depend on."""
+        """The settings that hard draws at a given ``p`` depend on."""
         ...
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
@@ -183,7 +183,7 @@ class BinnedFactor:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What draws at given probabilities depend on; excludes their relaxation, and the logits behind them."""
+        """The settings that draws at given probabilities depend on, without relaxation and logits."""
         names = ("coordinate", "bins", "low", "high", "geometric", "periodic")
         return {name: getattr(self, name) for name in names}
 

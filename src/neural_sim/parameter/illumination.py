@@ -77,7 +77,7 @@ class Illumination:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What images at given weights depend on."""
+        """The settings that images at given weights depend on."""
         return {"anchors": self.anchors}
 
     @property

@@ -36,7 +36,7 @@ class Parameter(Protocol):
 
 
 class Covered(Protocol):
-    """What photographs show of a factor's bins."""
+    """Coverage of the bins of a factor by photographs."""
 
     @property
     def missing(self) -> list[int]:
@@ -130,7 +130,7 @@ class SceneDistribution:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What hard draws at given probabilities depend on; excludes the relaxation and the logits."""
+        """The settings that hard draws at given probabilities depend on, without relaxation and logits."""
         drawn = {"factors": [factor.drawn for factor in self.factors], "ranges": dict(self.ranges)}
         return drawn | {"distance_unit": self.distance_unit}
 

@@ -1,4 +1,4 @@
-"""What both mesh renderers draw: triangles, their albedo, and the light on both of their sides."""
+"""Surfaces for both mesh renderers: triangles, their albedo, and the light on both of their sides."""
 
 from __future__ import annotations
 

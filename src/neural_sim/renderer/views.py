@@ -28,7 +28,7 @@ from neural_sim.types import PinholeCamera, PosedViews
 log = logging.getLogger(__name__)
 
 Backend = Literal["auto", "pyrender", "raycast"]
-"""What draws meshes. auto: pyrender over EGL, else over OSMesa, else ray casting, with a line in the log."""
+"""Backend that draws meshes. auto: pyrender over EGL, else over OSMesa, else ray casting, with a line in the log."""
 
 PROBE_SECONDS = 60
 # Draws one triangle: a context may be created and still fail at its first shader.

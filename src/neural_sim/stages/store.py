@@ -70,7 +70,7 @@ class Audit:
 
 @dataclass(frozen=True)
 class Store:
-    """Results under ``root/<kind>/<key>.pt``, with the key's description beside each as JSON."""
+    """Results under ``root/<kind>/<key>.pt``, with the description of the key next to each as JSON."""
 
     root: Path
 

@@ -1,4 +1,4 @@
-"""What a run needs from its target, and what all targets of photographs share."""
+"""The interface of targets, and the parts that all targets of photographs share."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Worst:
         """Yield checks of all recorded violations."""
         yield Check(f"psi not finite: {label}", self.not_finite, 0.0, status, wanted)
         yield Check(f"step beyond max_step: {label}", self.excess, 8 * eps(DOUBLE) * MAX_STEP)
-        # log p carries eps |psi| of the softmax part (at most 30 nats of it show beside the floor) and k roundings.
+        # log p carries eps |psi| of the softmax part (at most 30 nats of it exceed the floor) and k roundings.
         yield Check(f"p off its simplex: {label}", self.off_simplex, (8 + 30) * 8 * eps(DOUBLE))
 
 

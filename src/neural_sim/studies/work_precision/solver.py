@@ -88,7 +88,7 @@ class Inverse:
     b: Float[Tensor, "n"]
     oracle: Oracle
     seconds: float
-    """Of the oracle's eigenvalues."""
+    """The eigenvalues of the dense reference."""
     timing: Timing
     seed: int
 
