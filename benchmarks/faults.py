@@ -89,21 +89,26 @@ class Place:
         path = Path(f"{self.run}.log")
         return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
 
-    def start(self) -> Any:
-        """Start the command in a new process and a new folder."""
+    def start(self, log: Path | None = None) -> Any:
+        """Start the command in a new process and a new folder; what it says goes to ``log``, or next to the folder."""
         self.runs += 1
         paths = [f"paths.store={self.root}/store", f"paths.mlflow={self.root}/mlflow.db"]
         arguments = [*SMALL, *paths, f"hydra.run.dir={self.run}"]
-        process = _processes().Process(target=run_command, args=(arguments, f"{self.run}.log"))
+        process = _processes().Process(target=run_command, args=(arguments, str(log or f"{self.run}.log")))
         process.start()
         return process
 
-    def bits(self) -> dict[str, str]:
-        """Return digests of all results, excluding times, and of the data set."""
+    def stored(self) -> dict[str, str]:
+        """Return digests of all results in the store, excluding times."""
         found = {}
         for path in sorted(self.store.root.glob("*/[!.]*.pt")):
             entry = self.store.fetch(path.parent.name, path.stem, {}, functools.partial(_missing, path))
             found[f"{path.parent.name}/{path.stem}"] = _digest(entry.value)
+        return found
+
+    def bits(self) -> dict[str, str]:
+        """Return digests of all results, excluding times, and of the data set."""
+        found = self.stored()
         for path in sorted((self.run / "dataset").rglob("*")):
             if path.is_file():
                 found[str(path.relative_to(self.run))] = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -305,6 +310,25 @@ def together(work: Path, bits: Mapping[str, str], count: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def reference_in(work: Path) -> tuple[Place, float]:
+    """Run the command undisturbed; return where, and its seconds. ``empty.db`` in ``work`` is a new database."""
+    from neural_sim.report.tracking import connect, tracking_uri
+
+    connect(tracking_uri(str(work / "empty.db")))
+    place = Place(work / "reference")
+    place.root.mkdir()
+    shutil.copy(work / "empty.db", place.root / "mlflow.db")
+    first = _processes().Process(target=time.sleep, args=(0,))
+    first.start()
+    first.join()
+    begun = time.monotonic()
+    process = place.start()
+    process.join()
+    if process.exitcode != 0:
+        raise SystemExit(f"the reference failed:\n{place.log[-3000:]}")
+    return place, time.monotonic() - begun
+
+
 def main() -> None:
     """Run all parts and write the document."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -318,21 +342,7 @@ def main() -> None:
     random.seed(given.seed)
     with tempfile.TemporaryDirectory(prefix="faults") as folder:
         work = Path(folder)
-        from neural_sim.report.tracking import connect, tracking_uri
-
-        connect(tracking_uri(str(work / "empty.db")))
-        place = Place(work / "reference")
-        place.root.mkdir()
-        shutil.copy(work / "empty.db", place.root / "mlflow.db")
-        first = _processes().Process(target=time.sleep, args=(0,))
-        first.start()
-        first.join()
-        begun = time.monotonic()
-        process = place.start()
-        process.join()
-        seconds = time.monotonic() - begun
-        if process.exitcode != 0:
-            raise SystemExit(f"the reference failed:\n{place.log[-3000:]}")
+        place, seconds = reference_in(work)
         reference = place.bits()
         document: dict[str, Any] = {"results": len(reference), "seconds": round(seconds, 1)}
         checkpoint = None

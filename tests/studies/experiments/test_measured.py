@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from neural_sim.configuration import UserError
 from neural_sim.report import tracking
 from neural_sim.report.provenance import commit
 from neural_sim.studies.experiments.measured import (
@@ -38,9 +39,13 @@ def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
     assert file.name == "page.json" and read_measured(file, BUDGET) == {}
     write_measured(file, BUDGET, ROWS)
     assert read_measured(file, BUDGET) == ROWS
-    assert read_measured(file, {**BUDGET, "views": {"count": 12}}) == {}
     assert read_measured(file, {**BUDGET, "later": {"count": 12}}) == ROWS  # a key that the runs did not know
-    assert read_measured(file, {"views": BUDGET["views"]}) == {}  # one that is gone
+    with pytest.raises(UserError, match=r"another scale \(budget\.views\.count was \d+ and is 12 now\)"):
+        read_measured(file, {**BUDGET, "views": {**BUDGET["views"], "count": 12}})
+    with pytest.raises(
+        UserError, match=r"\(budget\.\S+ was .+ and is gone\); want that scale, or another page"
+    ):
+        read_measured(file, {"views": BUDGET["views"]})
 
 
 def test_the_cell_names_the_commits():

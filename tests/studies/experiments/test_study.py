@@ -7,7 +7,7 @@ from composing import composed
 from finished_runs import BUDGET, setting
 from omegaconf import OmegaConf
 
-from neural_sim.configuration import conf_directory
+from neural_sim.configuration import UserError, conf_directory
 from neural_sim.report.runs import LeftOut
 from neural_sim.studies.experiments import study as module
 from neural_sim.studies.experiments.layouts import LAYOUTS, Paper
@@ -159,9 +159,10 @@ def test_a_page_keeps_what_it_said_of_experiments_without_runs_here(page, tmp_pa
     with monkeypatch.context() as elsewhere:
         elsewhere.setattr(module.Settings, "read", lambda self, runs: ([], []))
         step = Experiments(rows=ROWS, paper=PAPER, draws=5, page=at, only=["large"])
-        assert "NSO 75.2" not in step.write("uri", {"budget": smaller, "seed": 0}, tmp_path), (
-            "of another scale"
-        )
+        before = (tmp_path / "page.json").read_bytes()
+        with pytest.raises(UserError, match=r"experiments\.page: .* another scale"):
+            step.write("uri", {"budget": smaller, "seed": 0}, tmp_path)
+        assert (tmp_path / "page.json").read_bytes() == before
 
 
 def test_a_page_keeps_settings_without_runs_here_beside_those_with(page, tmp_path, monkeypatch):

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neural_sim.configuration import UserError
 from neural_sim.documents import markdown_table, write_json
 from neural_sim.report import tracking
 from neural_sim.report.identity import at_scale
+from neural_sim.report.tracking import flatten
 
 
 @dataclass(frozen=True)
@@ -99,12 +101,23 @@ def document_of(page: str) -> Path:
 
 
 def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
-    """Read results by row name; empty if the file does not exist or is for another ``budget`` (scale)."""
+    """Read results by row name; empty if the file does not exist.
+
+    Raises:
+        UserError: its results are for another ``budget`` (scale): a page has one, and would lose them.
+    """
     if not file.is_file():
         return {}
     document = json.loads(file.read_text(encoding="utf-8"))
-    rows = document["rows"] if at_scale(document["budget"], budget) else {}
-    return {name: _row(**row) for name, row in rows.items()}
+    if not at_scale(document["budget"], budget):
+        had, have = flatten(document["budget"]), flatten(budget)
+        key = next(key for key in had if str(had[key]) != str(have.get(key)))
+        now = f"is {have[key]} now" if key in have else "is gone"
+        raise UserError(
+            f"experiments.page: the results in {file} are for another scale (budget.{key} was {had[key]} and {now}); "
+            "want that scale, or another page"
+        )
+    return {name: _row(**row) for name, row in document["rows"].items()}
 
 
 def _row(entries: Sequence[Mapping[str, Any]] = (), **row: Any) -> Measured:
