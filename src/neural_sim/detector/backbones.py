@@ -30,7 +30,7 @@ def group_norm(channels: int) -> nn.GroupNorm:
 
 
 def set_activation(module: nn.Module, activation: str) -> None:
-    """Replace every ReLU below ``module``, never in place: function transforms replay the graph."""
+    """Replace every ReLU in ``module`` by ``activation``, never in place: function transforms replay the graph."""
     for name, child in module.named_children():
         if isinstance(child, nn.ReLU):
             setattr(module, name, ACTIVATIONS[activation]())
@@ -39,7 +39,7 @@ def set_activation(module: nn.Module, activation: str) -> None:
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions added to their input; width and size do not change."""
+    """Two convolutions with a skip connection; channels and resolution stay the same."""
 
     def __init__(self, channels: int, activation: str) -> None:
         super().__init__()
@@ -75,8 +75,8 @@ PLANS = {
 class Stages(nn.Module):
     """A sequence of modules, some of which end a stage; the maps at ``strides`` are the backbone's output.
 
-    ``children`` are under the attribute ``under``, which is part of their parameters' names; ``ends`` gives the strides
-    of those that end a stage, from fine to coarse. ``channels`` are the maps' widths by stride.
+    ``children`` are registered in the attribute ``under``, which becomes part of their parameter names. ``ends`` maps
+    each module that ends a stage to its stride, from fine to coarse. ``channels`` maps strides to numbers of channels.
     """
 
     def __init__(
@@ -101,9 +101,9 @@ class Stages(nn.Module):
         return tuple(maps[stride] for stride in self.strides)
 
     def divided(self, layers: int) -> tuple[Stages, LastStages]:
-        """Divide the backbone into two parts, the second with the last ``layers`` stages.
+        """Split the backbone in two, with the last ``layers`` stages in the second part.
 
-        The parts share the backbone's parameters: each has those that it needs, under their own names.
+        Both parts share the backbone's parameters: each holds the ones it needs, under unchanged names.
 
         Raises:
             ValueError: ``layers`` is below 1, or not below the number of stages.
@@ -131,9 +131,9 @@ class Stages(nn.Module):
 
 
 class LastStages(nn.Module):
-    """The last stages of a backbone, which compute all maps from those of the first stages; parameters ``backbone.*``.
+    """The last stages of a backbone; their parameters are named ``backbone.*``.
 
-    They continue the last of the given maps; the first ``kept`` maps are passed on unchanged.
+    They run on the last of the given maps. The first ``kept`` maps pass through unchanged.
     """
 
     def __init__(self, stages: Stages, kept: int) -> None:
@@ -175,7 +175,7 @@ def resnet_backbone(
     body = builder(norm_layer=group_norm if weights is None else FrozenBatchNorm2d)
     if weights not in (None, SAVED):
         body.load_state_dict(load_weights(architecture, weights), strict=False)
-    # Weights were trained with ReLU and keep it.
+    # Pretrained weights expect the ReLU that they were trained with.
     set_activation(body, activation if weights is None else "relu")
     widening = 4 if architecture == "resnet50" else 1
     widths = {4: 64 * widening, 8: 128 * widening, 16: 256 * widening, 32: 512 * widening}
@@ -191,8 +191,8 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
     (``DEFAULT``, ``IMAGENET1K_V1``, ...), which torchvision downloads or takes from its cache.
 
     Raises:
-        ValueError: ``weights`` is neither a file nor a weight name, or the file has no state dictionary or one that
-            does not fit.
+        ValueError: ``weights`` is neither a file nor a weight name, or the file's state dictionary is missing or does
+            not fit.
     """
     if Path(weights).is_file():
         try:
@@ -222,7 +222,7 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
 def build_backbone(
     architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
 ) -> Stages:
-    """Build a backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output.
+    """Build a backbone by name; it returns a tuple of maps, and ``channels`` has their widths by stride.
 
     Raises:
         ValueError: the weights do not exist or do not fit.

@@ -20,10 +20,10 @@ def cached_features(
 ) -> tuple[Tensor, ...]:
     """Compute feature maps [n, channels, height, width] of images [n, 3, H, W] in [0, 1], one tensor for each level.
 
-    They are computed batch by batch on the backbone's device, without a graph.
+    They are computed batch by batch on the backbone's device, without an autograd graph.
 
     Raises:
-        ValueError: the set is empty, such as a target set without images, and so has no mean loss.
+        ValueError: there are no images (for instance, an empty target set), so the mean loss is undefined.
     """
     if len(images) == 0:
         raise ValueError("cached_features: got no images, want at least one")
@@ -39,7 +39,7 @@ class CachedSet:
     Attributes:
         detector: the detector.
         features: one tensor [n, ...] for each level.
-        targets: the targets of the images' anchors.
+        targets: the anchor targets of the images.
     """
 
     detector: Detector
@@ -64,9 +64,9 @@ class CachedSet:
     def streamed(
         detector: Detector, backbone: Parameters, sets: Iterable[LabelledImages], batch_size: int = 64
     ) -> CachedSet:
-        """Compute the result of ``of`` on all images joined, in the same batches.
+        """Compute what ``of`` returns for all ``sets`` concatenated, in the same batches.
 
-        Only one of ``sets`` and a batch are in memory at a time.
+        Only one set and one batch are in memory at a time.
 
         Raises:
             ValueError: there is no set.
@@ -85,7 +85,7 @@ class CachedSet:
 
     @staticmethod
     def concatenate(parts: Sequence[CachedSet]) -> CachedSet:
-        """Join the images of all ``parts``, which must come from one detector and have one size."""
+        """Join the images of all ``parts``, which must share a detector and an image size."""
         targets = Targets(
             torch.cat([part.targets.labels for part in parts]),
             torch.cat([part.targets.deltas for part in parts]),
@@ -119,7 +119,7 @@ class CachedSet:
         return self.detector.per_image_loss(params, inputs[:-1], targets)
 
     def select(self, index: Tensor) -> CachedSet:
-        """Return the subset of the images ``index``."""
+        """Return the set of the images ``index`` only."""
         index = index.to(self.device)
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))

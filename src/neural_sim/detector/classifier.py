@@ -25,9 +25,9 @@ from neural_sim.ranges import NonNegative, validated
 
 @validated
 class Classifier(BackboneDetector):
-    """A classifier of images of one size, each of which shows one object.
+    """A classifier for images of a fixed size that show one object each.
 
-    An image without an object (label -1) has no loss.
+    The loss of an image without an object (label -1) is zero.
 
     See ``BackboneDetector`` for the arguments, which it checks.
     """

@@ -1,4 +1,4 @@
-"""FCOS (Tian et al. 2019): at every place of every level, a point predicts its distances to the sides of a box."""
+"""FCOS (Tian et al. 2019): each feature-map location is a point that predicts its distances to a box's sides."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class FcosHead(nn.Module):
     """torchvision's head with two branches.
 
     The code holds the distances, in strides, to the left, upper, right and lower side of the box, and the centre-ness
-    logit. Softplus keeps the distances positive: torchvision's ReLU, which is kept if ``activation`` is relu, has no
-    curvature, and no gradient at negative values.
+    logit. Softplus keeps the distances positive. torchvision's ReLU, which ``activation=relu`` keeps, has no curvature,
+    and no gradient at negative values.
     """
 
     def __init__(self, settings: Head, num_classes: int, activation: str) -> None:
@@ -45,8 +45,8 @@ class FcosHead(nn.Module):
         )
         self.regression_head = FCOSRegressionHead(settings.channels, 1, settings.convs, norm_layer=norm)
         if settings.normalisation == "group":
-            # Normalisation subtracts any shift that all channels of a group share. Its gradient is a rounding error:
-            # AdamW divides by it, and the derivative through a training would magnify it.
+            # Normalisation cancels a shift that all channels of a group share, so that its gradient is mere rounding
+            # error. AdamW would divide by that error, and the derivative through a training would magnify it.
             for branch in (self.classification_head, self.regression_head):
                 for layer in branch.conv:
                     if isinstance(layer, nn.Conv2d):
@@ -68,7 +68,7 @@ class Fcos(PyramidDetector):
     """An FCOS for images of one size; holds its shape, its points and its loss, never its parameters.
 
     Args:
-        points: which points should find which object.
+        points: which points are assigned to which object.
         focal_alpha, focal_gamma: parameters of the focal loss (Lin et al. 2017, Eq. 5).
 
     See ``PyramidDetector`` for the other arguments, which it checks.
@@ -145,7 +145,10 @@ class Fcos(PyramidDetector):
 
 
 def generalised_iou(ours: Float[Tensor, "*n 4"], theirs: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
-    """Compute it for boxes around a shared point, from its distances to their sides; ``theirs`` have an area."""
+    """Compute the generalised IoU of boxes around a common point, given as its distances to their sides.
+
+    The boxes ``theirs`` must have a positive area.
+    """
     least, most = torch.minimum(ours, theirs), torch.maximum(ours, theirs)
     inside, hull, area, other = (_area(part) for part in (least, most, ours, theirs))
     union = area + other - inside

@@ -47,7 +47,7 @@ def assign_anchors(
     foreground_iou: float,
     background_iou: float,
 ) -> Targets:
-    """Match anchors to boxes like torchvision's ``Matcher`` with low-quality matches, without its loop.
+    """Match anchors to boxes like torchvision's ``Matcher`` with low-quality matches, but all images at once.
 
     Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding. An anchor takes the box it overlaps
     most if that overlap reaches ``foreground_iou``, or if no anchor overlaps that box more; it is ignored
@@ -73,7 +73,7 @@ def assign_anchors(
     anchor_labels = torch.where(foreground, labels.gather(1, match), BACKGROUND)
     anchor_labels = torch.where(ignored, IGNORED, anchor_labels)
     matched = boxes.gather(1, match[..., None].expand(-1, -1, 4))
-    # Background anchors get themselves as boxes: padding rows have no logarithm, and zero times NaN is NaN.
+    # Background anchors are matched to themselves: padding boxes have no log size, and zero times NaN is NaN.
     matched = torch.where(foreground[..., None], matched, anchors)
     tiled = anchors.expand(images, -1, 4).reshape(-1, 4)
     deltas = encode_boxes(matched.reshape(-1, 4), tiled, boxes.new_ones(4)).view(images, -1, 4)
@@ -139,8 +139,8 @@ def focal_loss(
 ) -> Float[Tensor, "*shape"]:
     """Compute the sigmoid focal loss of each element (Lin et al. 2017, Eq. 5); ``targets`` are 0 or 1.
 
-    It is written with softplus instead of binary_cross_entropy_with_logits: stable for large logits, with derivatives
-    of every order in forward and reverse mode.
+    Softplus, unlike binary_cross_entropy_with_logits, has derivatives of every order in forward and reverse mode, and
+    is stable for large logits as well.
     """
     sign = 2 * targets - 1
     cross_entropy = F.softplus(-sign * logits)
@@ -152,8 +152,8 @@ def focal_loss(
 def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Float[Tensor, "*shape"]:
     """Compute the loss of each element's error in an encoded box coordinate.
 
-    ``pseudo_huber`` is delta (sqrt(1 + (r / delta)^2) - 1): quadratic within ``delta``, slope 1 far out like
-    ``l1``, smooth everywhere. ``l1`` is torchvision's default and has no curvature.
+    ``pseudo_huber`` is delta (sqrt(1 + (r / delta)^2) - 1): quadratic within ``delta``, of slope 1
+    for large errors like ``l1``, smooth everywhere. ``l1`` is torchvision's default and has no curvature.
     """
     if kind == "l1":
         return residual.abs()
@@ -165,6 +165,6 @@ def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Floa
 def proximal_loss(
     params: Mapping[str, Tensor], anchor: Mapping[str, Tensor], proximal: float
 ) -> Float[Tensor, ""]:
-    """Compute ``proximal / 2 |params - anchor|^2`` over the names in ``params``; not differentiated by the anchor."""
+    """Compute ``proximal / 2 |params - anchor|^2`` over the names in ``params``; the anchor is a constant."""
     squares = [(value - anchor[name].detach()).square().sum() for name, value in params.items()]
     return 0.5 * proximal * torch.stack(squares).sum()

@@ -62,12 +62,12 @@ IN_FULL: dict[Score, str] = {"AP": "AP (0.50 to 0.95)", "accuracy": "Top-1 accur
 
 
 def of_document(document: Mapping[str, Any]) -> TestScore:
-    """Return the score that a document, such as one of results.json or the store, holds; its fields tell the kind."""
+    """Read a score from its dictionary in results.json or the store; the fields tell which kind it is."""
     return AveragePrecision(**document) if "ap" in document else Accuracy(**document)
 
 
 def mean_of(document: Mapping[str, Any]) -> float:
-    """Return the mean over classes of such a document."""
+    """Return the mean over classes from a score's dictionary (see ``of_document``)."""
     return document["ap"] if "ap" in document else document["accuracy"]
 
 
@@ -77,11 +77,11 @@ def evaluate(
     class_names: Sequence[str],
     score: Score = "AP",
 ) -> TestScore:
-    """Score ``predictions``, one dictionary for each image, as from ``Detector.predict``.
+    """Score ``predictions``, one dictionary for each image, as returned by ``Detector.predict``.
 
     Raises:
-        ValueError: there are no images, predictions and images differ in number, a label has no name, or accuracy is
-            wanted of an image with objects of two classes.
+        ValueError: there are no images, predictions and images differ in number, a label has no name, or the score is
+            accuracy and an image shows objects of two classes.
     """
     if len(images) == 0:
         raise ValueError("evaluate: got no images, want at least one")
@@ -110,7 +110,7 @@ def evaluate(
 
 
 def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> str | None:
-    """Say in one line why a score is meaningless and what to do; None if it is not."""
+    """Explain in one line why a score is meaningless and what to do; None if it is meaningful."""
     known = [value for value in score.per_class.values() if value == value]
     if not known:
         return "no class has a box in these images, so that nothing is scored: want labels of the classes"
@@ -124,7 +124,7 @@ def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> 
 
 
 def best_classes(predictions: Sequence[Mapping[str, Tensor]]) -> Int[Tensor, "images"]:
-    """Return the class of each image's best prediction; -1 without one."""
+    """Return the class of each image's best prediction; -1 if there is none."""
     best = [p["labels"][p["scores"].argmax()] if len(p["scores"]) else -1 for p in predictions]
     return torch.tensor([int(label) for label in best])
 

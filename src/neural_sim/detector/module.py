@@ -24,11 +24,11 @@ Batch = tuple[tuple[Tensor, ...], Targets]
 @validated
 @dataclass(frozen=True)
 class Optimisation:
-    """A training of a detector: AdamW with linear warm-up and cosine decay to zero.
+    """Settings of a detector's training: AdamW with linear warm-up and cosine decay to zero.
 
     Args:
-        epochs, batch_size: the budget of steps.
-        learning_rate: peak of the schedule; 0: parameters do not change.
+        epochs, batch_size: these set the number of steps.
+        learning_rate: peak of the schedule; 0 leaves the parameters unchanged.
         weight_decay: decoupled weight decay of convolution weights (not of biases and normalisations).
         warmup_fraction: fraction of the steps over which the learning rate rises.
     """
@@ -41,17 +41,17 @@ class Optimisation:
 
 
 class DetectorModule(pl.LightningModule):
-    """A training of the parameters ``learned`` by the detector's mean loss.
+    """Trains the parameters ``learned`` on the detector's mean loss.
 
-    Batches are (inputs, targets). Inputs are the images (one tensor [n, 3, h, w]) where the backbone is learned,
-    else the features of the frozen backbone (one tensor for each level).
+    Batches are (inputs, targets). Inputs are images (one tensor [n, 3, h, w]) if the backbone is learned, otherwise
+    features of the frozen backbone (one tensor for each level).
 
     Args:
         learned: the parameters that are trained; they are copied.
         fixed: all other parameters; never written to.
         total_steps: optimiser steps until the learning rate reaches zero.
-        anchor: anchor of the detector's proximal term, for all learned names; without it the term is left out.
-        recording: which part of the steps ``trajectory`` records.
+        anchor: anchor of the detector's proximal term, for all learned names; None: no such term.
+        recording: which of the steps ``trajectory`` records.
 
     Raises:
         ValueError: the recording does not fit its memory limit.
@@ -90,7 +90,7 @@ class DetectorModule(pl.LightningModule):
         return {name: value.detach().clone() for name, value in zip(self._names, self._values, strict=True)}
 
     def trajectory(self, rows: Sequence[Tensor]) -> Trajectory:
-        """Return the steps done so far; their batches had these ``rows``.
+        """Return the record of the steps done so far; ``rows`` are the rows of their batches.
 
         Raises:
             ValueError: nothing was recorded.

@@ -1,7 +1,7 @@
 """The network's shape, built from torchvision's parts, and its random initial values.
 
-The values are always passed in. They are drawn with an explicit generator; torch's module constructors know only
-the global one.
+Parameter values are always passed in. They are drawn here from an explicit generator, because torch's module
+constructors use only the global one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from neural_sim.detector.settings import Anchors, Head
 
 
 class NormalisedBackbone(nn.Module):
-    """Images in [0, 1] to feature maps; parameters ``backbone.*``."""
+    """A backbone preceded by the normalisation of images in [0, 1]; its parameters are named ``backbone.*``."""
 
     def __init__(self, backbone: nn.Module) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class NormalisedBackbone(nn.Module):
     @override
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         mean, std = (_channels(values, images) for values in (IMAGENET_MEAN, IMAGENET_STD))
-        # A third faster on a CPU than the default layout, in both directions.
+        # A third faster on a CPU than the default layout, forwards and backwards.
         return self.backbone(((images - mean) / std).contiguous(memory_format=torch.channels_last))
 
 
@@ -43,7 +43,7 @@ def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
 
 
 class CoarserLevels(ExtraFPNBlock):
-    """Levels past the backbone's last map C5 (Lin et al. 2017, Sec. 4).
+    """Pyramid levels above the backbone's last map C5 (Lin et al. 2017, Sec. 4).
 
     P6 is a convolution of stride 2 on C5, P7 one on the activated P6, and so on. No level is smaller than one pixel.
     """
@@ -67,7 +67,7 @@ class CoarserLevels(ExtraFPNBlock):
 
 
 class Predictor(nn.Module):
-    """The feature pyramid, and the head that its levels share; parameters ``fpn.*`` and ``head.*``."""
+    """The feature pyramid, and the head that its levels share; parameters are named ``fpn.*`` and ``head.*``."""
 
     def __init__(self, fpn: FeaturePyramidNetwork, head: nn.Module) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class Predictor(nn.Module):
 def build_predictor(
     in_channels: list[int], levels: int, head: nn.Module, settings: Head, activation: str
 ) -> Predictor:
-    """Build the pyramid of ``levels``, including those past the last of ``in_channels``, and the head."""
+    """Build a pyramid with ``levels`` levels, more than ``in_channels`` if some are coarser, and its head."""
     channels, norm = settings.channels, group_norm if settings.normalisation == "group" else None
     coarser = levels - len(in_channels)
     extra = CoarserLevels(in_channels[-1], channels, coarser, activation) if coarser else None
@@ -97,7 +97,7 @@ def build_predictor(
 def fixed_anchors(
     settings: Anchors, image_size: tuple[int, int]
 ) -> tuple[Float[Tensor, "anchors 4"], list[int]]:
-    """Return the anchors of all levels in pixels, and each level's number; a fixed image size fixes them, too."""
+    """Return the anchors of all levels in pixels, and the number of anchors of each level."""
     scale = 1.0 if settings.reference is None else min(image_size) / settings.reference
     sizes = tuple(tuple(scale * size for size in level) for level in settings.sizes)
     generator, strides = AnchorGenerator(sizes, (tuple(settings.ratios),) * len(sizes)), settings.strides

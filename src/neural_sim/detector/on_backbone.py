@@ -1,8 +1,8 @@
-"""What detectors on a backbone share: initial values, which of them are trained, features of images.
+"""Base classes of detectors with a backbone: initial values, trained parameters, image features.
 
-The modules here are only the network's shape. Their values are always passed in as an argument, so that training losses
-can be differentiated any number of times. Most detectors put torchvision's feature pyramid on the backbone, and one
-head on all its levels.
+The modules here only define the network's shape. Parameter values are always passed in as an argument, so that training
+losses can be differentiated any number of times. Most detectors add torchvision's feature pyramid and one head, which
+all its levels share.
 """
 
 from __future__ import annotations
@@ -37,16 +37,17 @@ ImageSize = PositiveInt | tuple[PositiveInt, PositiveInt]
 class BackboneDetector(Detector):
     """A detector whose images pass through a backbone. A subclass sets ``_predictor``, the network on its features.
 
-    ``normalisation`` is how the backbone first scales the channels (red, green, blue) of images in [0, 1].
+    ``normalisation`` has the mean and the standard deviation by which the backbone first normalises the channels (red,
+    green, blue) of images in [0, 1].
 
     Args:
         num_classes: number of classes, counted from 0, without a background class.
         image_size: (height, width) in pixels, or one number for a square.
         backbone: settings of the backbone.
-        strides: strides of those of its maps that are features.
+        strides: strides of the maps that serve as features.
         activation: ``silu`` or ``relu`` (torchvision's own).
         proximal: see ``Detector``.
-        prior: foreground probability of the untrained predictor; None: it has no such output.
+        prior: foreground probability that the untrained predictor outputs; None: it has no such output.
     """
 
     normalisation: ClassVar[dict[str, tuple[float, ...]]] = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
@@ -74,13 +75,13 @@ class BackboneDetector(Detector):
         self._widths = [body.channels[stride] for stride in strides]
 
     def in_loop(self, layers: int | None) -> BackboneDetector:
-        """Return the detector with its last stages trained in the psi loop, as the base class says.
+        """Return the detector as the psi loop trains it, with the last ``layers`` stages of its backbone.
 
-        None means the last stage of our small backbones, but none of a ResNet's, which have millions of parameters.
+        None means one stage of the small backbones, and none of a ResNet, whose stages have millions of parameters.
 
         Raises:
-            ValueError: the backbone has published weights, whose normalisation is frozen; or the number of stages is
-                below 0 or not below that of all stages.
+            ValueError: the backbone has published weights, whose normalisation is frozen; or ``layers`` is negative or
+                not below the backbone's number of stages.
         """
         if layers is None:
             layers = int(self._settings.architecture in PLANS)
@@ -121,7 +122,7 @@ class BackboneDetector(Detector):
         return {name: tuple(value.shape) for name, value in state.items()}
 
     def learnable(self, params: Parameters) -> list[str]:
-        """Name everything that a full training changes: all except frozen statistics or a frozen backbone."""
+        """Name the parameters that a full training changes: all except frozen statistics or a frozen backbone."""
         learned = (self._predictor,) if self._settings.freeze else (self._backbone, self._predictor)
         names = {n for module in learned for n, _ in module.named_parameters()}
         return [name for name in params if name in names]
@@ -168,11 +169,12 @@ class BackboneDetector(Detector):
 
 
 class PyramidDetector(BackboneDetector):
-    """A backbone, a feature pyramid and a head; a subclass makes the head, and its targets and losses.
+    """A backbone, a feature pyramid and a head; a subclass provides the head, the targets and the losses.
 
     Args:
         head: settings of the head and the pyramid.
-        strides: strides of the pyramid's levels; ``where`` is their key.
+        strides: strides of the pyramid's levels.
+        where: configuration key that holds the strides, for messages.
         network: the head's module, with ``Head.channels`` channels; it returns ``cls_logits`` [n, anchors, classes]
             and ``bbox_regression`` [n, anchors, code].
         activation: ``silu`` or ``relu`` (torchvision's own), for backbone, pyramid and head.
@@ -217,6 +219,6 @@ class PyramidDetector(BackboneDetector):
 
 
 def _coarser(own: tuple[int, ...], strides: tuple[int, ...], available: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the strides of the levels past the backbone's last; none if its last map is not used."""
+    """Return the strides of the levels coarser than the backbone's last map; none if that map is not used."""
     last, count = available[-1], len(strides) - len(own)
     return tuple(last * 2**n for n in range(1, count + 1)) if last in own else ()

@@ -1,4 +1,4 @@
-"""A detector as ONNX: from images to the decoded boxes and scores of all anchors, or to detections."""
+"""Export a detector to ONNX, with the decoded boxes and scores of all anchors, or detections, as outputs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TOLERANCE = 1e-4
 
 
 class Decoded(nn.Module):
-    """A detector from images [n, 3, h, w] in [0, 1] to boxes and scores of all anchors.
+    """A detector that maps images [n, 3, h, w] in [0, 1] to boxes and scores of all anchors.
 
     Boxes [n, anchors, 4] are (x0, y0, x1, y1) in pixels, scores [n, anchors, classes] are in [0, 1].
     """
@@ -89,7 +89,7 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
 
 @torch.no_grad()
 def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "n 3 h w"]) -> float:
-    """Compare torch with onnxruntime on a file without non-maximum suppression.
+    """Compare torch with onnxruntime, on an ONNX file exported without non-maximum suppression.
 
     Returns:
         The largest difference of scores, and of boxes as fractions of the image's longer side.
@@ -112,7 +112,7 @@ def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the exporter's notices, which call for no action."""
+    """Silence the exporter's notices, which users need not act on."""
     noisy = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in noisy]
     with warnings.catch_warnings():

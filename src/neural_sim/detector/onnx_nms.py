@@ -13,7 +13,7 @@ INPUTS = ("anchor_boxes", "anchor_scores")
 
 
 def with_nms(model: Any, saved: SavedDetector) -> Any:
-    """Continue ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``, with the steps of ``Detector.predict``.
+    """Append the steps of ``Detector.predict`` to ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``.
 
     It takes the best candidates of each level, suppresses within each class, and keeps the best ``limit`` of an image.
     """

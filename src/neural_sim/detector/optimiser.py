@@ -1,4 +1,4 @@
-"""Optimiser steps as pure functions of flat vectors, which are differentiated to reverse a training.
+"""Optimiser steps as pure functions of flat vectors, so that a training can be differentiated in reverse.
 
 A state is theta followed by the optimiser's buffers. A step consists of elementwise torch operations, which autograd
 can differentiate.
@@ -20,8 +20,8 @@ State = tuple[Tensor, ...]
 class AdamW:
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019, Algorithm 2), as ``torch.optim.AdamW`` steps.
 
-    ``weight_decay`` is one number, or one for each entry of theta. The buffers are the two moments. ``floor`` is the
-    least denominator of every entry.
+    ``weight_decay`` is one number, or one for each entry of theta. The buffers are the two moments. ``floor`` is a
+    lower bound of the denominator, entry by entry.
     """
 
     weight_decay: float | Float[Tensor, "n"] = 1e-2
@@ -34,7 +34,7 @@ class AdamW:
         return theta, torch.zeros_like(theta), torch.zeros_like(theta)
 
     def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State:
-        """Return the state after a step, of which ``done`` came before."""
+        """Return the state after the next step; ``done`` steps came before it."""
         theta, first, second = state
         fast, slow = self.betas
         first = fast * first + (1.0 - fast) * gradient
@@ -45,19 +45,19 @@ class AdamW:
         return theta, first, second
 
     def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> AdamW:
-        """Return the rule to differentiate instead, after a training of ``done`` steps that ended in ``end``.
+        """Return the rule to differentiate in place of this one, after ``done`` steps that ended in ``end``.
 
-        Its least denominator is ``fraction`` times the larger of two numbers: the entry's denominator in the last step,
-        and the root mean square of those of its tensor. For a ``fraction`` of 0 the rule is unchanged. ``sizes`` are
-        the numbers of entries of theta's tensors, in their order.
+        It bounds the denominator from below by ``fraction`` times the larger of two numbers: the entry's denominator in
+        the last step, and the root mean square of the denominators in its tensor. A ``fraction`` of 0 leaves the rule
+        unchanged. ``sizes`` are the numbers of entries of theta's tensors, in order.
 
         While an entry's gradients are tiny (a level of the pyramid before the first batch with an object of its size),
         a step is the ratio of the moments, whatever their size, and its derivative is about 1 / |g|: thousands of times
-        that of other entries. Yet a finite change of the batch's images brings a gradient of the usual size, which
-        moves the moments too, and changes the step by no more than the learning rate. The last step's second moment
-        averages the whole training, and shows that usual size. If the entry's gradients stayed tiny to the end (a
-        class's weight on a channel that is dark in all images of the present distribution), the other entries of its
-        tensor show what is usual.
+        that of other entries. But a finite change of the batch's images produces a gradient of normal size, which moves
+        the moments too, and changes the step by no more than the learning rate. The last step's second moment averages
+        over the whole training and shows that normal size. If the entry's gradients stay tiny to the end (a class's
+        weight on a channel that is dark in all images of the present distribution), the other entries of its tensor
+        show what is normal.
         """
         if fraction == 0.0:
             return self

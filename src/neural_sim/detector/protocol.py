@@ -31,10 +31,10 @@ def score_of(make: Callable[..., Detector]) -> Score:
 
 @dataclass(frozen=True)
 class Best:
-    """The best detections of every class in every image, image by image and class by class, the best first.
+    """The best detections of every class in every image, ordered by image, then class, then falling score.
 
-    ``boxes`` are (x0, y0, x1, y1) in pixels. ``logits`` and ``boxes`` are differentiable in the outputs from which they
-    come; the choice of these outputs is fixed.
+    ``boxes`` are (x0, y0, x1, y1) in pixels. ``logits`` and ``boxes`` are differentiable in the outputs they come from;
+    the choice of these outputs is not differentiated.
     """
 
     image: Int[Tensor, "m"]
@@ -54,14 +54,14 @@ class Detector(ABC):
 
     - ``proximal``: lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, where theta_0 is the
         warm start;
-    - ``detections``: which predictions are detections;
+    - ``detections``: which predictions count as detections;
     - ``anchors_per_level``: number of anchors of each level; the best candidates are taken level by level. None: one
         level;
-    - ``normalisation``: how features first scale the channels of images, for model files;
+    - ``normalisation``: how ``features`` first normalises the channels of images, for model files;
     - ``score``: the kind of score.
 
-    "Anchors" are the places to which outputs belong, of whatever kind: boxes (RetinaNet) or points (FCOS). A subclass
-    defines the abstract methods; docs/extending.md has an example.
+    "Anchors" stands for whatever the outputs belong to, boxes (RetinaNet) or points (FCOS). A subclass defines the
+    abstract methods; docs/extending.md has an example.
     """
 
     normalisation: ClassVar[Mapping[str, tuple[float, ...]] | None] = None
@@ -108,8 +108,8 @@ class Detector(ABC):
     def in_loop(self, layers: int | None) -> Detector:
         """Return the detector as the psi loop trains it.
 
-        ``split`` leaves the last ``layers`` stages of its backbone to train; None: as many as this kind of detector
-        proposes. The base class has no stages.
+        Its ``split`` counts the last ``layers`` stages of the backbone as trainable; None: the detector's own default.
+        The base class has no stages.
 
         Raises:
             ValueError: the backbone has no such stages.
@@ -126,7 +126,7 @@ class Detector(ABC):
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def learnable(self, params: Parameters) -> list[str]:
-        """Name everything that a training outside the psi loop changes: by default all parameters."""
+        """Name the parameters that a training outside the psi loop changes: by default all."""
         return list(params)
 
     def per_image_loss(
@@ -139,14 +139,14 @@ class Detector(ABC):
         return self.losses_of(self.outputs(trainable, features), targets)
 
     def ranking(self, outputs: Outputs) -> Float[Tensor, "n anchors classes"]:
-        """Return logits of the scores by which detections are ranked: by default those of the classes."""
+        """Return logits of the scores by which detections are ranked: by default the class logits."""
         return outputs[0]
 
     def best(self, outputs: Outputs, per_class: int, candidates: int = 100) -> Best:
         """Choose at most ``per_class`` detections of each class in each image.
 
-        They are chosen among its ``candidates`` best logits by non-maximum suppression. No score is too low: a box that
-        is missed today should be able to rise.
+        Non-maximum suppression chooses them among the image's ``candidates`` best logits. There is no score threshold:
+        the score of an object that is missed now must be able to rise.
         """
         logits, code = self.ranking(outputs), outputs[1]
         top, index = logits.detach().flatten(1).topk(min(candidates, logits[0].numel()))
@@ -179,7 +179,7 @@ class Detector(ABC):
     def _chosen(
         self, scores: Float[Tensor, "n anchors classes"], code: Float[Tensor, "n anchors code"]
     ) -> list[dict[str, Tensor]]:
-        """Choose the candidates of all images at once and move them to the CPU, where each image has only a few."""
+        """Choose the candidates of all images at once, on the device, and move only these to the CPU."""
         levels, first = [], 0
         for level in scores.split(list(self.anchors_per_level or [scores.shape[1]]), 1):
             best, index = level.flatten(1).topk(min(self.detections.candidates, level[0].numel()))

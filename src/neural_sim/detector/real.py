@@ -1,4 +1,4 @@
-"""Labelled photographs in a training: which of them are used, and in what proportion to synthetic images."""
+"""Labelled photographs in training: which ones are used, and in what proportion to synthetic images."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ Fewer = Literal["refuse", "all"]
 @validated
 @dataclass(frozen=True)
 class Real:
-    """The use of labelled photographs, the target's training set, in training.
+    """How training uses labelled photographs (the target's training set).
 
     Args:
         mode: ``combined``: every training (warm start, psi loop, scored detectors) uses synthetic images and
             photographs. ``pretrain``: scored detectors are trained on synthetic images and then fine-tuned on
             photographs; the warm start and the psi loop see synthetic images only. ``none``: no photographs.
-        count: number of photographs; 0 means ``none``. A smaller number is a subset of a larger one.
-        fraction: fraction of the photographs, instead of ``count``. Neither: all of them.
-        batch_fraction: for ``combined``: fraction of every batch that are photographs, drawn repeatedly. A training
-            has as many steps as without them. None: photographs are treated like all other images, once in every epoch.
+        count: number of photographs; 0 means ``none``. A smaller count uses a subset of a larger one's photographs.
+        fraction: fraction of the photographs, instead of ``count``. Without either, all of them are used.
+        batch_fraction: for ``combined``: fraction of photographs in every batch, drawn repeatedly; the number of steps
+            is the same as without them. None: photographs are used like all other images, once in every epoch.
         finetune: for ``pretrain``: number of steps on photographs, as a fraction of those on synthetic images.
         finetune_learning_rate: peak learning rate of these steps.
         fewer: what to do if there are fewer photographs than ``count``: ``refuse``, or take ``all`` of them with
@@ -85,7 +85,7 @@ class Real:
         return count
 
     def of(self, available: int) -> Real:
-        """Return the settings expressed by a ``count``, so that equal trainings have equal keys.
+        """Return equivalent settings with an explicit ``count``, so that equal trainings have equal keys.
 
         Raises:
             ValueError: as for ``number``.
@@ -104,7 +104,7 @@ class Real:
         return photographs.select(torch.randperm(available, generator=stream(seed, "photographs"))[:count])
 
     def sampling(self, synthetic: int, photographs: int, batch_size: int) -> Sampling | None:
-        """Return how batches of ``synthetic`` images and ``photographs`` after them are drawn; None: all alike."""
+        """Return how batches are drawn from ``synthetic`` images followed by ``photographs``; None: all alike."""
         if self.batch_fraction is None:
             return None
         real = min(max(1, round(self.batch_fraction * batch_size)), batch_size - 1)
@@ -137,7 +137,7 @@ class Sampling:
             )
 
     def batches(self, generator: torch.Generator) -> Iterator[Int[Tensor, "batch"]]:
-        """Yield the rows of one batch after the other, without end."""
+        """Yield the rows of one batch after another, endlessly."""
         starts = [sum(self.pools[:place]) for place in range(len(self.pools))]
         pools = zip(self.pools, self.per_batch, strict=True)
         drawn = [shuffled_passes(size, count, generator) for size, count in pools]

@@ -1,4 +1,4 @@
-"""RetinaNet (Lin et al. 2017): anchor boxes of several sizes at every place of every level."""
+"""RetinaNet (Lin et al. 2017): anchor boxes of several sizes at every location of every level."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class RetinaNet(PyramidDetector):
         return assign_anchors(self.anchors.to(boxes), boxes, labels, *self._overlaps)
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Add up each image's focal and box loss, sums over anchors divided by the number of foreground anchors."""
+        """Sum each image's focal and box losses over anchors, divided by the number of foreground anchors."""
         (logits, deltas), costs = outputs, self._losses
         labels = targets.labels
         classes = torch.arange(self.num_classes, device=labels.device)

@@ -1,4 +1,4 @@
-"""A trained detector as two files, and what it finds in photographs.
+"""Save and load a trained detector as two files, and detect objects in photographs with it.
 
 ``model.safetensors`` has its parameters. ``model.json`` has everything else that is needed to build and use it: its
 class and settings, class names, image size, normalisation, camera.
@@ -44,9 +44,9 @@ KEYS = ("format", "version", "weights", "class_names", "image", "detector", "cam
 class SavedDetector:
     """A detector with its parameters.
 
-    ``make`` is its constructor, as made by ``conf/detector``, without classes and image size; ``class_names`` are
-    in the order of labels, ``image_size`` is (height, width) in pixels; ``camera`` is the camera of the images it was
-    trained on, if known.
+    ``make`` is its constructor as configured in ``conf/detector``, which still takes the number of classes and the
+    image size. ``class_names`` are in the order of labels, ``image_size`` is (height, width) in pixels, ``camera`` is
+    the camera of the training images, if known.
     """
 
     make: Callable[..., Detector]
@@ -68,7 +68,7 @@ class SavedDetector:
         """Write both files, ``model.json`` last, and return the path of the parameters.
 
         Raises:
-            ValueError: JSON has no value for some setting, see ``described``.
+            ValueError: a setting cannot be written as JSON, see ``described``.
         """
         document = {
             "format": FORMAT,
@@ -187,7 +187,7 @@ def _params(path: Path, weights: Mapping[str, Any], file: Path) -> Parameters:
 
 
 def _normalisation(detector: Detector) -> dict[str, list[float]] | None:
-    """Return how the detector first scales images in [0, 1], if it says so."""
+    """Return the channel normalisation that the detector declares, or None."""
     stored = getattr(detector, "normalisation", None)
     return None if stored is None else {key: list(values) for key, values in stored.items()}
 
@@ -243,10 +243,10 @@ def detect(saved: SavedDetector, photos: Sequence[Image.Image]) -> list[dict[str
 
 
 def described(make: Callable[..., Detector]) -> dict[str, Any]:
-    """Describe a detector's constructor as made by ``conf/detector``: a class, or a partial call of one.
+    """Describe a detector's constructor as configured in ``conf/detector``: a class, or a partial call of one.
 
-    ``settings`` has all arguments except the classes and the image size, defaults included, because another version
-    of the project may change them.
+    ``settings`` has all arguments except the number of classes and the image size. It includes defaults, because
+    another version of the project may change them.
 
     Returns:
         The constructor's ``class`` and ``settings``.
@@ -257,7 +257,7 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
     kind, given = make, {}
     while isinstance(
         kind, functools.partial
-    ):  # Hydra's own partial is a subclass, which stays when it is called partially again
+    ):  # functools.partial does not flatten Hydra's own partial, which is a subclass
         kind, given = kind.func, {**kind.keywords, **given}
     defaults = {
         name: parameter.default
@@ -272,7 +272,9 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
 def rebuilt(
     description: Mapping[str, Any], file: Path, outside: str | None = None
 ) -> Callable[..., Detector]:
-    """Invert ``described``. No code runs except that of the named class, which must derive from ``Detector``.
+    """Rebuild the constructor that ``described`` described, a class that must derive from ``Detector``.
+
+    No code runs except that class's own.
 
     For ``outside`` see ``SavedDetector.load``.
 

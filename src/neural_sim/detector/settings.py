@@ -35,9 +35,9 @@ class Backbone:
     """The network that turns images into feature maps.
 
     Args:
-        architecture: which network it is.
+        architecture: name of the network.
         weights: initial weights of a ResNet: None (random), a file with a torchvision state dictionary, or
-            torchvision's name of the weights. Model files have ``saved`` if the backbone had weights.
+            torchvision's name of the weights. Model files say ``saved`` if the backbone had weights.
         freeze: train only the predictor, in every training. For the psi loop see ``outer.loop_layers``.
     """
 
@@ -55,7 +55,7 @@ class Backbone:
 @validated
 @dataclass(frozen=True)
 class Head:
-    """The feature pyramid, and the head that is applied to all its levels.
+    """The feature pyramid, and the head that all its levels share.
 
     Args:
         channels: width of the pyramid and the head.
@@ -73,12 +73,12 @@ class Head:
 @validated
 @dataclass(frozen=True)
 class Anchors:
-    """The boxes from which predictions start, and which of them should find which object.
+    """The anchor boxes, and how they are assigned to objects.
 
     Args:
-        strides: strides of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16), then twice the last
+        strides: strides of the pyramid's levels, chosen from 4, 8, 16 and 32 (micro and tiny: 8 and 16), then doubled
             for each coarser level, see ``network.CoarserLevels``.
-        sizes: for each level, the side of a square with an anchor's area, in pixels of an image whose shorter side is
+        sizes: for each level, the square roots of the anchors' areas, in pixels of an image whose shorter side is
             ``reference``; they scale with the image.
         reference: that side in pixels; None: sizes are in pixels of any image, as in torchvision.
         ratios: aspect ratios of the anchors, height / width.
@@ -108,10 +108,10 @@ class Anchors:
 @validated
 @dataclass(frozen=True)
 class Points:
-    """The points of an FCOS, and which of them should find which object.
+    """The points of an FCOS, and how they are assigned to objects.
 
     Args:
-        strides: strides of the pyramid's levels, as in ``Anchors``; a level has a point in every stride.
+        strides: strides of the pyramid's levels, as in ``Anchors``; a level has one point per stride.
         limits: for all levels but the last, the largest distance from a point to a side of its box, in pixels of an
             image whose shorter side is ``reference``; larger distances belong to the next level.
         reference: that side in pixels; None: limits are in pixels of any image.
@@ -128,7 +128,7 @@ class Points:
             raise ValueError(f"Points.limits: want one for each stride but the last, got {list(self.limits)}")
 
     def ranges(self, shorter_side: float) -> list[tuple[float, float]]:
-        """Return each level's distances to the farthest side, in pixels of an image of this size."""
+        """Return each level's range of distances to the farthest side, in pixels of an image of this size."""
         scale = 1.0 if self.reference is None else shorter_side / self.reference
         bounds = [0.0, *(scale * limit for limit in self.limits), float("inf")]
         return list(itertools.pairwise(bounds))
@@ -155,7 +155,7 @@ class Losses:
 @validated
 @dataclass(frozen=True)
 class Detections:
-    """How detections are chosen among predictions.
+    """How detections are selected from predictions.
 
     The ``candidates`` best scores of each level above ``score_threshold`` go through non-maximum suppression within
     each class at ``nms_iou``; the best ``limit`` of an image are kept.

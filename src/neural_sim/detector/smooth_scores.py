@@ -1,9 +1,9 @@
 """Smooth scores, which the psi loop differentiates instead of the validation loss.
 
 Average precision: detections come from the forward pass, after non-maximum suppression. Their anchors are fixed; their
-scores and boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is a true
-positive (a sigmoid of its overlap), and whether it ranks below another (of the difference of logits; Brown et al. 2020,
-Smooth-AP, Eq. 6). Top-1 accuracy: the step of the right class being the best becomes its probability.
+scores and boxes are differentiated. Two step functions of COCO's definition become sigmoids: whether a detection is a
+true positive (a sigmoid of its overlap), and whether it ranks below another (a sigmoid of the difference of logits;
+Brown et al. 2020, Smooth-AP, Eq. 6). Top-1 accuracy: whether the right class is best becomes that class's probability.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ THRESHOLDS = tuple(0.5 + 0.05 * step for step in range(10))
 
 @dataclass(frozen=True)
 class Ranked:
-    """One class's detections in all images, and the nearest box of each; image by image, by falling score.
+    """One class's detections in all images, with the nearest box of each; ordered by image, then falling score.
 
-    ``overlaps`` (intersection over union) are those with the nearest box of the class in the image, 0 if there is none.
-    ``image`` is each detection's image; ``box`` is the number of the nearest box among all boxes, -1 for none.
+    ``overlaps`` is each detection's intersection over union with the nearest box of the class in its image, 0 if there
+    is none. ``image`` is its image; ``box`` is the index of the nearest box among all boxes, -1 for none.
     ``boxes`` counts the class's boxes.
     """
 
@@ -47,9 +47,9 @@ class SmoothAP:
     Args:
         temperature: width of the ranks' sigmoid, in logits; AP is the limit at 0.
         width: width of the true positives' sigmoid, in intersection over union; AP is the limit at 0.
-        per_class: number of an image's best detections that count for each class.
+        per_class: number of best detections of each class in an image that count.
         loss: weight of the training loss that is added: the AP of a class without true positives has no gradient, but
-            its loss has.
+            its loss does.
     """
 
     temperature: Positive = 0.2
@@ -82,7 +82,7 @@ class SmoothAP:
         true = self.true_positives(detections)
         candidates = (detections.box >= 0).nonzero().flatten()  # only these can be true positives
         above = torch.sigmoid((detections.logits - detections.logits[candidates, None]) / self.temperature)
-        # In its own rank the sigmoid counts a detection as a half; it must count as 1.
+        # The sigmoid counts a detection as one half in its own rank, where it must count as one.
         above = above + 0.5 * (candidates[:, None] == torch.arange(len(detections.box), device=above.device))
         precision = (above @ true) / above.sum(1, keepdim=True)
         added = (true[candidates] * precision).mean(1) / detections.boxes
@@ -91,8 +91,8 @@ class SmoothAP:
     def true_positives(self, detections: Ranked) -> Float[Tensor, "m thresholds"]:
         """Compute the degree in [0, 1] to which each detection is a true positive, at each threshold.
 
-        It is the degree from the overlap, times the degree to which no better detection of the same box is one. The
-        degrees of a box sum to at most 1.
+        It is the degree given by the overlap, times the degree to which no better-ranked detection is a true positive
+        of the same box. The degrees of a box sum to at most 1.
         """
         levels = detections.overlaps.new_tensor(THRESHOLDS)
         matched = torch.sigmoid((detections.overlaps[:, None] - levels) / self.width)
@@ -124,7 +124,7 @@ def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_cla
 def nearest_box(
     boxes: Float[Tensor, "m 4"], truth: Float[Tensor, "m boxes 4"], present: Bool[Tensor, "m boxes"]
 ) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"]]:
-    """Find each detection's largest intersection over union with a box of its image, and that box; 0 and -1 without."""
+    """Find each detection's largest intersection over union with a box of its image, and that box; 0, -1 for none."""
     if truth.shape[1] == 0:
         return boxes.new_zeros(len(boxes)), torch.full_like(boxes[:, 0], -1, dtype=torch.long)
     overlaps = torch.where(present, overlap(boxes[:, None], truth), 0.0)
@@ -143,12 +143,12 @@ def overlap(a: Float[Tensor, "*#n 4"], b: Float[Tensor, "*#n 4"]) -> Float[Tenso
 @validated
 @dataclass(frozen=True)
 class SmoothAccuracy:
-    """Settings of the smooth accuracy: whether the right class is best becomes its softmax probability.
+    """Settings of the smooth accuracy: the mean softmax probability of the right class.
 
     Args:
         temperature: temperature of the softmax, in logits; accuracy is the limit at 0.
-        loss: weight of the training loss that is added: an image whose class is far from the best has hardly a gradient
-            of its own, but its loss has.
+        loss: weight of the training loss that is added: for an image whose class is far from the best, that probability
+            has hardly any gradient, but the loss does.
     """
 
     temperature: Positive = 0.5

@@ -29,15 +29,15 @@ from neural_sim.types import LabelledImages
 @validated
 @dataclass(frozen=True)
 class Training:
-    """Training settings of every detector, whatever the method that chose its images.
+    """Training settings that detectors share, whichever method chose their images.
 
-    ``image_size`` is the side of the square images in pixels. ``warm_start`` says which distribution the images of the
-    warm start have: all parameters uniform, or psi's initial one. ``warm_epochs`` are the epochs of the warm start,
-    ``cold_epochs`` those of the detectors that are scored. ``real`` says whether labelled photographs train too. For
+    ``image_size`` is the side of the square images in pixels. ``warm_start`` is the distribution of the warm start's
+    images: all parameters uniform, or the initial psi. ``warm_epochs`` are the epochs of the warm start,
+    ``cold_epochs`` those of the detectors that are scored. ``real`` says how training uses labelled photographs. For
     the rest see ``Optimisation``.
 
     Raises:
-        ValueError: a batch of one image should hold photographs and synthetic images.
+        ValueError: batches of one image cannot mix photographs with synthetic images.
     """
 
     image_size: Annotated[int, Ge(16)] = 96
@@ -77,9 +77,9 @@ class TrainingHistory:
 
 
 class Batches:
-    """Inputs and targets in batches, in an order that the generator shuffles each epoch, or as ``sampling`` says.
+    """Batches of inputs and targets, shuffled by the generator in each epoch, or drawn as ``sampling`` says.
 
-    ``drawn`` has the rows of each batch so far.
+    ``drawn`` collects the rows of every batch so far.
 
     Raises:
         ValueError: the sampling is for another number of images.
@@ -131,13 +131,13 @@ def train_detector(
 
     Args:
         detector: the detector.
-        params: where the training starts.
+        params: the initial parameters.
         generator: shuffles the batches.
         how: the optimiser and its budget.
         images: the images, on the device of ``params``. If they are given as features, or the detector freezes its
             backbone, only the pyramid and the head are trained.
-        anchor: theta_0; adds the detector's proximal term, over what is trained, to the loss. None: no such term.
-        recording: which part of the steps the history keeps (None: nothing).
+        anchor: theta_0; adds the detector's proximal term over the trained parameters to the loss. None: no such term.
+        recording: which of the steps the history keeps (None: none).
         sampling: how batches are drawn from ``images`` (None: each image once in every epoch).
 
     Returns:
@@ -170,7 +170,7 @@ def train_detector(
 
 
 def _check_finite(losses: Sequence[float], how: Optimisation) -> None:
-    """Refuse a training that diverged: its parameters are not numbers, and would silently detect nothing."""
+    """Refuse a diverged training, whose parameters are NaN and would silently detect nothing."""
     for epoch, loss in enumerate(losses, 1):
         if not math.isfinite(loss):
             raise ValueError(

@@ -21,7 +21,7 @@ MEGABYTE = 2**20
 @validated
 @dataclass(frozen=True)
 class Recording:
-    """The part of a training that is recorded.
+    """How much of a training is recorded.
 
     Args:
         part: fraction of the steps, counted from the end, that can be reversed.
@@ -61,7 +61,7 @@ class Trajectory:
 
     ``rows`` are each step's batch, as rows of the training set; the step's gradient is that of the batch's mean loss
     (plus the proximal term). ``rates`` are the learning rates. ``checkpoints`` are the states before some steps;
-    ``gradients`` are those of all steps from the first checkpoint on, or none. ``end`` is theta after the last step.
+    ``gradients`` are those of all steps from the first checkpoint on, or empty. ``end`` is theta after the last step.
     """
 
     rule: AdamW
@@ -91,7 +91,7 @@ class Trajectory:
         return min(self.checkpoints)
 
     def segments(self) -> list[range]:
-        """Return the steps from checkpoint to checkpoint, the last ones first."""
+        """Return the ranges of steps between checkpoints, the last range first."""
         starts = sorted(self.checkpoints)
         ends = [*starts[1:], len(self)]
         return [range(begin, end) for begin, end in zip(starts, ends, strict=True)][::-1]
