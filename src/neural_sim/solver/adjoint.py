@@ -53,7 +53,7 @@ class AdjointSolver:
         damping: the choice of lambda.
         mode: how Hessian products are computed, see ``HessianOperator``.
         rtol, max_steps: passed to the linear solver.
-        retain_graph: keep the first pass of all chunks between products: faster, memory of all chunks at once.
+        retain_graph: keep the graph of the first gradient between products: faster, but with all chunks in memory.
         max_raises: limit on the increases of lambda after negative curvature was met (a fixed lambda is never raised).
         sensitivity: also solve at 2 lambda, to measure the influence of the damping: up to ``max_steps`` more products.
     """

@@ -39,12 +39,12 @@ class Status(enum.Enum):
 class Solution:
     """Result of ``A x = b``; every field is finite whatever the inputs were.
 
-    ``residual`` is ``|b - A x| / |b|`` recomputed from a fresh product, never the recursion's, hence
-    unchanged when A and b are rescaled; 0 for b = 0, and 1 where no value is finite and ``value`` is
-    zero. Only an APPROXIMATE value may have a residual above 1. ``curvature`` is the smallest and largest
-    Rayleigh quotient ``p^T A p / p^T p`` of all products taken (0, 0 if none). ``products`` counts all
-    applications of A, ``steps`` the solver's own iterations. ``warm_started`` says whether x0 was used (it is
-    dropped when its residual is no better than that of zero).
+    ``residual`` is ``|b - A x| / |b|``, computed from a fresh product, never taken from the recurrence. Rescaling A or
+    b does not change it. It is 0 for b = 0, and 1 if nothing finite was found and ``value`` is zero. Only an
+    APPROXIMATE value may have a residual above 1. ``curvature`` is the smallest and largest Rayleigh quotient
+    ``p^T A p / p^T p`` of all products (0, 0 if none). ``products`` counts all applications of A, ``steps`` the
+    solver's own iterations. ``warm_started`` says whether x0 was used (it is dropped if its residual is no better than
+    that of zero).
     """
 
     value: Float[Tensor, "n"]
@@ -60,7 +60,7 @@ class Solution:
 class Iterate:
     """Where an iteration stopped; CONVERGED here is a claim that ``LinearSolver.solve`` checks.
 
-    ``residual`` is the norm of ``rhs - A value`` from a fresh product where the iteration ended on one, else None.
+    ``residual`` is the norm of ``rhs - A value`` from a fresh product if the iteration ended with one, else None.
     """
 
     value: Float[Tensor, "n"]
@@ -71,7 +71,7 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Search:
-    """State of a search by conjugate directions, to be continued.
+    """State of a conjugate-gradient search, from which the search can continue.
 
     ``residual`` is ``b - A value`` by the recurrence, ``direction`` the next search direction. Solvers other than
     conjugate gradients use only the iterate, ``value``.
@@ -90,8 +90,8 @@ class Search:
 class System:
     """``operator x = rhs`` as passed to a solver's iteration: ``rhs`` has norm in [1, 2), ``tolerance`` is absolute.
 
-    ``residual`` is the residual at ``start``. Where it meets the tolerance, it comes from a fresh product; otherwise it
-    may come from a search's recurrence, and then ``direction`` is the search's next direction.
+    ``residual`` is the residual at ``start``. If it meets the tolerance, it comes from a fresh product. Otherwise it
+    may come from a search's recurrence; ``direction`` is then the search's next direction.
     """
 
     operator: Watched
@@ -205,7 +205,7 @@ def _started(
     tolerance: float,
     max_steps: int,
 ) -> System:
-    """Start the system at the guess if its relative residual is below 1, that of zero; else start at zero."""
+    """Start at the guess if its relative residual is below 1, the residual of zero; otherwise start at zero."""
     cold = System(operator, rhs, torch.zeros_like(rhs), rhs, None, tolerance, max_steps)
     value = guess.value if isinstance(guess, Search) else guess
     if value is None or not bool(torch.isfinite(value).all()) or not bool(value.any()):

@@ -1,4 +1,4 @@
-"""Conjugate gradients (Hestenes and Stiefel 1952) that keep the best iterate and name non-positive curvature."""
+"""Conjugate gradients (Hestenes and Stiefel 1952) that keep the best iterate and report non-positive curvature."""
 
 from __future__ import annotations
 

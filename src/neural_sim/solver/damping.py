@@ -35,11 +35,11 @@ class Damped:
 
     @property
     def condition(self) -> float:
-        """Estimated condition number of the damped operator; nan where no spectrum was estimated."""
+        """Estimated condition number of the damped operator; nan if no spectrum was estimated."""
         return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
 
     def search(self, times: float = 1.0) -> Search | None:
-        """Solve at ``times`` lambda from the products that the estimate already took; None without them."""
+        """Solve at ``times`` lambda using the products that the estimate already computed; None without them."""
         return None if self.krylov is None else self.krylov.search(times * self.value)
 
 
@@ -80,10 +80,10 @@ class LanczosDamping(Damping):
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
     last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
 
-    The Krylov space starts from the right-hand side, as conjugate gradients do: with lambda past its smallest Ritz
-    value, their first steps cannot break down. (A few steps from a random start miss the few negative eigenvalues of a
-    detector among many near zero: on a tiny RetinaNet 12 steps gave -0.01, where lambda_min was -2.4.) If a longer
-    solve still meets negative curvature, lambda is raised past it.
+    The Krylov space starts from the right-hand side, as conjugate gradients do. Since lambda exceeds minus its smallest
+    Ritz value, their first steps cannot break down. (From a random start, a few steps miss a detector's few negative
+    eigenvalues among many near zero: on a tiny RetinaNet, 12 steps gave -0.01 where lambda_min was -2.4.) If a longer
+    solve still meets negative curvature, lambda is raised until it exceeds that too.
     """
 
     margin: Positive = 0.25

@@ -40,7 +40,7 @@ class Exact(LinearSolver):
                 f"exact: got {size} unknowns, max_size is {self.max_size}; use an iterative solver"
             )
         matrix = operator.dense(rhs)
-        # Rounding may leave the products unsymmetric. Halve first: two entries near the largest float overflow.
+        # Rounding may leave the products asymmetric. Halving first keeps the sum of huge entries from overflowing.
         matrix = 0.5 * matrix + 0.5 * matrix.T
         scale = float(matrix.abs().max())
         if scale == 0.0:

@@ -21,7 +21,7 @@ Mode = Literal["reverse_over_reverse", "central_difference"]
 
 
 class HessianOperator:
-    """The operator ``vector -> H vector``, H the Hessian of ``sum(term(params) for term in terms)`` at ``params``.
+    """The operator ``vector -> H vector`` for the Hessian H of ``sum(term(params) for term in terms)`` at ``params``.
 
     Args:
         terms: the terms of the loss.
@@ -63,13 +63,13 @@ class HessianOperator:
         return gradient(self._terms, self._params if at is None else unflatten(at, self._params))
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Multiply a vector."""
+        """Apply the Hessian to a vector."""
         if self._mode == "central_difference":
             return self._central_difference(vector)
         return self._reverse_over_reverse(vector)
 
     def dense(self, batch: int = 64) -> Float[Tensor, "n n"]:
-        """Build the matrix: ``batch`` columns at a time on a retained graph, else one product a column."""
+        """Build the matrix: ``batch`` columns at a time on a retained graph, otherwise one product per column."""
         if self._retained is None:
             return columns(self, self._point)
         basis = torch.eye(self.size, dtype=self._point.dtype, device=self._point.device)
@@ -113,7 +113,7 @@ class HessianOperator:
 
 
 def difference_length(point: Float[Tensor, "n"], vector: Float[Tensor, "n"]) -> float:
-    """Choose the h of the difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
+    """Choose h for the difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
 
     The truncation error (h |vector|)^2 and the rounding error eps / (h |vector|) balance at eps^(1/3), relative to the
     size of the point.

@@ -38,7 +38,7 @@ class Krylov:
     def search(self, shift: float) -> Search | None:
         """Compute where m conjugate-gradient steps from zero on ``(A + shift I) x = b`` end, without any product.
 
-        Krylov spaces do not depend on the shift. None where the shifted matrix is not positive definite on this space.
+        Krylov spaces do not depend on the shift. None if the shifted matrix is not positive definite on this space.
 
         With T the shifted tridiagonal matrix, T y = |b| e_1 and T z = e_m, the value is Q y and its residual r is -y_m
         times ``beyond``. Q z is the only direction in the space that is conjugate to all earlier ones; hence
@@ -88,7 +88,7 @@ def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
     eigenvectors contribute to the start vector. Memory: ``steps`` vectors.
 
     Raises:
-        ValueError: a start that is zero or not finite, or fewer steps than 1.
+        ValueError: the start is zero or not finite, or ``steps`` is below 1.
     """
     if steps < 1:
         raise ValueError(f"lanczos: steps must be at least 1, got {steps}")

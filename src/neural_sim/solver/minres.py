@@ -1,4 +1,4 @@
-"""Minimum residuals (Paige and Saunders 1975) for symmetric operators, indefinite and singular ones included."""
+"""The minimum residual method (Paige and Saunders 1975), for symmetric operators, even indefinite or singular ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from neural_sim.solver.operator import Watched, dot, norm
 @validated
 @dataclass(frozen=True)
 class MinimumResidual(LinearSolver):
-    """Minimum residuals, for any symmetric operator.
+    """The minimum residual method (MINRES), for any symmetric operator.
 
     The residual falls monotonically. On an inconsistent singular system it ends at a least-squares solution and reports
     that. ``restart_gain`` as in ``ConjugateGradient``.
@@ -54,10 +54,10 @@ class MinimumResidual(LinearSolver):
 
 
 def _minimises(operator: Watched, residual: Float[Tensor, "n"]) -> bool:
-    """Whether ``|A r| <= 10 sqrt(eps) |A| |r|`` for the true residual.
+    """Check that ``|A r| <= 10 sqrt(eps) |A| |r|`` for the true residual.
 
-    The recurrence has an estimate of its own, but where the condition number exceeds 1 / sqrt(eps) rounding keeps the
-    true residual from reaching it.
+    The recurrence estimates this as well, but above a condition number of 1 / sqrt(eps), rounding keeps the true
+    residual from reaching that estimate.
     """
     limit = 10.0 * torch.finfo(residual.dtype).eps ** 0.5 * max(abs(end) for end in operator.curvature)
     return norm(operator(residual)) <= limit * norm(residual)
@@ -75,7 +75,7 @@ class _Cycle:
 
 
 def _cycle(operator: Watched, residual: Float[Tensor, "n"], tolerance: float, budget: int) -> _Cycle:
-    """Run Lanczos' recurrence with Givens rotations on the tridiagonal matrix, until ``|r| <= tolerance``."""
+    """Run the Lanczos recurrence with Givens rotations on the tridiagonal matrix, until ``|r| <= tolerance``."""
     eta = norm(residual)  # the residual norm with its sign: last entry of the rotated right-hand side
     basis, before = residual / eta, torch.zeros_like(residual)
     direction, older = torch.zeros_like(residual), torch.zeros_like(residual)

@@ -26,10 +26,10 @@ def flatten(params: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
 
 
 def unflatten(vector: Float[Tensor, "n"], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Split a vector as ``flatten`` joined it, by the names and shapes of ``like``; the parts are differentiable views.
+    """Invert ``flatten``, with the names and shapes of ``like``; the parts are differentiable views.
 
     Raises:
-        ValueError: the vector has another length.
+        ValueError: the vector's length does not match.
     """
     wanted = sum(tensor.numel() for tensor in like.values())
     if vector.shape != (wanted,):
@@ -54,7 +54,7 @@ class Shifted:
     shift: float
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Multiply a vector."""
+        """Apply the operator to a vector."""
         return self.matvec(vector) + self.shift * vector
 
 
@@ -65,32 +65,32 @@ def numbers(*scalars: Shaped[Tensor, ""]) -> list[float]:
 
 
 def plain_norm(vector: Tensor) -> Float[Tensor, ""]:
-    """Take the Euclidean norm in float64, where squares stay in its range; still on the device."""
+    """Compute the Euclidean norm in float64, whose range holds float32 squares; it stays on the device."""
     return cast(Tensor, torch.linalg.vector_norm(vector, dtype=torch.float64))  # pyright: ignore[reportUnknownMemberType]
 
 
 def plain_dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Take the inner product in float64, still on the device."""
+    """Compute the inner product in float64; it stays on the device."""
     return left.double() @ right.double()
 
 
 def norm(vector: Tensor) -> float:
-    """Take the Euclidean norm in float64, for float32 entries up to 1e38 and float64 entries of any size."""
+    """Compute the Euclidean norm in float64, for float32 entries up to 1e38 and float64 entries of any size."""
     return in_range(float(plain_norm(vector)), vector)
 
 
 def in_range(size: float, vector: Tensor) -> float:
-    """Recompute the ``plain_norm`` of a vector, ``size``, if it left float64's range; else return ``size``."""
+    """Recompute a vector's ``plain_norm``, given as ``size``, if its squares left the range of float64."""
     if 1e-140 < size < 1e150 or not bool(torch.isfinite(vector).all()):
         return size
-    # Squares leave the range of float64. Scaling by a power of two, which is exact, avoids that.
+    # Scaling by a power of two is exact.
     exponent = math.frexp(float(vector.abs().max()))[1]
     scaled = torch.ldexp(vector.double(), torch.tensor(-exponent))
     return math.ldexp(float(plain_norm(scaled)), exponent)
 
 
 def dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> float:
-    """Take the inner product in float64."""
+    """Compute the inner product in float64."""
     return float(plain_dot(left, right))
 
 
@@ -110,7 +110,7 @@ class Product:
 
 
 class Watched:
-    """Counts an operator's products and tracks their Rayleigh quotients' range; raises ``NonFiniteProduct``."""
+    """Counts an operator's products and tracks the range of their Rayleigh quotients; raises ``NonFiniteProduct``."""
 
     def __init__(self, matvec: Matvec) -> None:
         self._matvec = matvec
@@ -123,15 +123,15 @@ class Watched:
         return (self._low, self._high) if self._low <= self._high else (0.0, 0.0)
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Multiply a vector."""
+        """Apply the operator to a vector."""
         return self.measured(vector).value
 
     def measured(self, vector: Float[Tensor, "n"]) -> Product:
-        """Multiply a vector, and compute the product's energy and norms in one transfer to the host.
+        """Apply the operator to a vector, and read the product's energy and norms in one transfer to the host.
 
         Raises:
             NonFiniteProduct: the product is not finite.
-            ValueError: the product has another shape.
+            ValueError: the product's shape differs from the vector's.
         """
         product = self._matvec(vector)
         if product.shape != vector.shape:
@@ -151,7 +151,7 @@ class Watched:
         return Product(product, energy, size, length)
 
     def dense(self, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
-        """Build the operator's matrix, by the operator's own ``dense`` if it has one; counts one product a column.
+        """Build the operator's matrix, with the operator's own ``dense`` if it has one; count one product per column.
 
         Raises:
             NonFiniteProduct: the matrix is not finite.
@@ -171,7 +171,7 @@ class Watched:
 
 
 def columns(matvec: Matvec, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
-    """Build a small operator's matrix from one product a column, with the type and device of ``like``."""
+    """Build a small operator's matrix from one product per column, with the type and device of ``like``."""
     matrix = like.new_empty(like.numel(), like.numel())
     basis = torch.zeros_like(like)
     for column in range(like.numel()):
@@ -182,7 +182,7 @@ def columns(matvec: Matvec, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
 
 
 def _own_matrix(matvec: Matvec) -> Tensor | None:
-    """Build the matrix by the operator's own ``dense``, which is faster than column by column; None without one."""
+    """Build the matrix with the operator's own ``dense``, faster than column by column; None if it has none."""
     if isinstance(matvec, Shifted):
         matrix = _own_matrix(matvec.matvec)
         return None if matrix is None else matrix + matvec.shift * torch.eye(len(matrix)).to(matrix)
