@@ -1,7 +1,7 @@
 """Quality of each iteration's hypergradient, the conditions that it fails, and what happens to the steps.
 
 An iteration takes one step for each object and each factor of psi. The solve, and the hypergradient as a whole, concern
-all steps; whether a derivative differs significantly from zero is tested for each one.
+all steps; whether the derivative differs significantly from zero is tested for each step.
 """
 
 from __future__ import annotations
@@ -45,8 +45,7 @@ class Trust:
             ``outer.certify_every``); None: no limit.
         on_untrusted: what happens to steps that fail: those of one object and factor if the derivative is not
             significant, all of them if the whole hypergradient fails. ``keep`` takes them whole, as the paper does.
-            ``stop`` skips steps without significance, and ends the loop if the whole hypergradient fails or no step is
-            left.
+            ``stop`` skips insignificant steps, and ends the loop if the whole hypergradient fails or no step is left.
         shrink: fraction of an untrusted step that is taken under ``on_untrusted=shrink``.
     """
 
@@ -58,9 +57,9 @@ class Trust:
 
 @dataclass(frozen=True)
 class ImplicitQuality:
-    """The recorded numbers of an ``ImplicitAdjoint``; None where one was not measured.
+    """The recorded numbers of an ``ImplicitAdjoint``; None for those that were not measured.
 
-    All come from an estimated spectrum: ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme
+    Three come from an estimated spectrum: ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme
     Ritz values, ``condition`` is the damped operator's condition number (inf if it is not positive definite).
     """
 
@@ -129,11 +128,11 @@ class Certificate:
     """Quality of one iteration's hypergradient.
 
     Attributes:
-        adjoint: how the adjoint went; None if trainings were compared instead.
+        adjoint: quality of the adjoint; None if trainings were compared instead.
         cosine: cosine with the finite-difference response of training; None if that was not measured.
         doubts: names of the failed conditions on the whole hypergradient.
-        p_values: by object and factor, of the null hypothesis that the derivative is zero. They test this iteration's
-            derivative or, for trust-region steps, the average over iterations that the steps follow.
+        p_values: p-values, by object and factor, of the null hypothesis that the derivative is zero. They test this
+            iteration's derivative or, for trust-region steps, the average over iterations that the steps follow.
         actions: what happens to the learned objects' steps. A step is kept if no condition fails and its derivative is
             significant. ``waiting`` adds which steps waited.
     """
@@ -268,12 +267,13 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
 
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Count, over recorded iterations, what happened to steps.
+    """Count what happened to the steps of recorded iterations.
 
-    The counts are: steps (one for each object and factor), trusted steps that waited, untrusted steps, what happened to
-    these and why (the failed conditions, or ``signal``: no significance), objects' steps that were judged, and those
-    that were rejected. Every measured cosine is listed. ``taken_back`` lists the objects that the loop returned to an
-    earlier psi, with the number of their accepted steps and how many of them they keep.
+    ``steps`` counts one for each object and factor, ``waited`` the trusted steps that waited, ``untrusted`` the
+    others; ``actions`` counts what happened to these, and ``doubts`` the reasons (the failed conditions, or ``signal``:
+    no significance). ``judged`` counts objects' steps that a training accepted or rejected, ``rejected`` the latter.
+    ``taken_back`` has the objects that the loop returned to an earlier psi, with the number of their accepted steps and
+    of those that they keep. ``cosines`` lists every measured cosine.
     """
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [

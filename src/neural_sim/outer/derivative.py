@@ -44,7 +44,7 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compo
     if noise is None or part.relaxed is None:
         raise ValueError("pathwise: these images were not drawn from psi by a relaxed draw")
 
-    # All images of an object are under psi's light.
+    # All images of an object share psi's light.
     light = None if part.draw.weights is None else part.draw.weights[0]
 
     def replay(psi: Tensor) -> SceneDraw:
@@ -66,7 +66,7 @@ def object_images(
 ) -> dict[str, ObjectImages]:
     """Return, by object name, the images that show the object, with their rows in the training set.
 
-    They have a path if draws are relaxed. ``weights`` are the weights of all images in the training loss.
+    Their ``path`` is None unless draws are relaxed. ``weights`` are the weights of all images in the training loss.
     """
     pixels = rendered.images.images
     bound = {}
@@ -109,7 +109,7 @@ def probe_groups(probed: ProbeSet, probes: Mapping[str, Mapping[str, Probes]]) -
 
 
 def inputs_of(inner: InnerLoop, examples: CachedSet) -> InputsOf:
-    """Return the function that computes a training set's inputs from its drawn images and their rows."""
+    """Return the function that computes a training set's inputs from drawn images and their rows."""
 
     def inputs(pixels: Tensor, rows: Tensor) -> tuple[Tensor, ...]:
         return (*inner.detector.features(inner.backbone, pixels), examples.targets.select(rows).deltas)

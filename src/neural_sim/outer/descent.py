@@ -43,9 +43,9 @@ class GradientLoop(OuterLoop, ABC):
 
     In a trust region, consecutive trainings use common random numbers. Each iteration begins with a training that
     accepts or rejects the last step, and the last iteration does nothing else. Before the first derivative, the loop
-    tries the psi that ``first`` proposes, if any; objects that it read stay there, unless the training rejected it
-    (``outer.refine``). The loop ends early once no object has a significant derivative. At
-    the end every other object goes back to the best psi that it has had.
+    tries the psi that ``first`` proposes, if any. Under ``outer.refine=unread``, the objects that it could estimate
+    stay there unless the training rejects their step. The loop ends early once no object has a significant derivative.
+    At the end, every object that was free to move returns to the best psi that it has had.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class GradientLoop(OuterLoop, ABC):
         self.trajectory.append(self.psi.detach().clone())
 
     def _offer(self) -> None:
-        """Train at the start, for comparison, then go to the psi that the first step proposes."""
+        """Train at the initial psi, for comparison, then move to the psi that the first step proposes."""
         steps = self.steps
         if self.first is None or not isinstance(steps, TrustRegionSteps):
             return
@@ -124,10 +124,10 @@ class GradientLoop(OuterLoop, ABC):
             self.psi.data[self._labels] = tried.reported
 
     def _settle(self, verdicts: Mapping[str, Verdict]) -> None:
-        """Leave the objects that the first step read where they are; if it read all of them, the loop has ended.
+        """Hold the objects that the first step estimated at their present psi; the loop ends if these are all objects.
 
-        They do not go back at the end either: a pair of trainings has judged them already, and what the target's boxes
-        show is better evidence than the scatter of trainings.
+        They do not return to an earlier psi at the end either: a pair of trainings has judged them already, and an
+        estimate from the target's boxes is better evidence than scores that scatter between trainings.
         """
         steps, rejected = self.steps, {name for name, verdict in verdicts.items() if not verdict.accepted}
         settled = read_objects(self.shown) - rejected
@@ -137,7 +137,7 @@ class GradientLoop(OuterLoop, ABC):
             self._way = self._way.settled(settled)
 
     def _trained_once(self) -> Trained:
-        """Train at psi, to record what it is worth."""
+        """Train at psi, to record its score."""
         trained = self.train_on(self.psi)
         self._saw(trained.scores, self.objects.names)
         return trained
@@ -157,16 +157,16 @@ class GradientLoop(OuterLoop, ABC):
         return trained, verdicts
 
     def _saw(self, scores: Float[Tensor, "classes images"], names: Iterable[str]) -> None:
-        """Note the scores that a training gives to the objects it saw, at their present psi."""
+        """Record a training's scores of the named objects at their present psi."""
         for name in names:
             self._way = self._way.seen(name, float(scores[self.scene.names.index(name)].sum()))
 
     def _derive(self) -> Derived:
-        """Take the derivative at psi: of one training, or in a trust region's first iteration of several."""
+        """Compute the derivative at psi, from one training, or from several in a trust region's first iteration."""
         first = not self.records
         for trial in range(self.settings.steps.trainings if first else 1):
             if trial or not first or self._offered:
-                self.renew()  # what is particular to one training averages out of the derivatives
+                self.renew()  # the noise of a single training averages out over the derivatives
             trained, result = self._differentiated()
             self.steps, p_values = self.steps.observe(result)
         return Derived(trained, result, p_values)
@@ -220,7 +220,7 @@ class GradientLoop(OuterLoop, ABC):
         return every > 0 and (len(self.records) + 1) % every == 0
 
     def _fold(self) -> Objective:
-        """Take the next part of L_val, so that derivatives also scatter with the choice of validation images."""
+        """Take the next part of L_val, so that the scatter of derivatives includes the choice of validation images."""
         count = self.settings.steps.folds
         if count == 1:
             return self.inner.objective
@@ -230,7 +230,7 @@ class GradientLoop(OuterLoop, ABC):
         return self._folds.pop()
 
     def derivative(self) -> Hypergradient:
-        """Take the derivative at psi as an iteration does, with new images and a new training; psi does not move."""
+        """Compute the derivative at psi as an iteration does, from new images and a new training; psi does not move."""
         self._prepare()
         trained = self.inner.train(self.psi, self.numbers, self.theta, self._recording)
         self.theta = trained.theta
@@ -263,7 +263,7 @@ class GradientLoop(OuterLoop, ABC):
     @override
     def restore(self, state: Mapping[str, Any]) -> None:
         self._before_folds = state["before_folds"]
-        if state["folds"]:  # parts are taken from the end: those that are left are the first
+        if state["folds"]:  # folds are popped from the end, so that the first ones are left
             self.numbers.generator.set_state(self._before_folds)
             count = self.settings.steps.folds
             self._folds = self.inner.objective.folds(count, self.numbers.generator)[: state["folds"]]
@@ -285,9 +285,10 @@ class GradientLoop(OuterLoop, ABC):
 
 
 def learned_objects(inner: InnerLoop) -> LearnedObjects:
-    """Choose the objects whose psi moves: those that were asked for, else all that validation images show.
+    """Choose the objects whose psi moves: those requested, otherwise all that validation images show.
 
-    For an object that they do not show, they only measure where it is mistaken for another, whatever its best psi is.
+    An object that none of them shows affects L_val only where it is mistaken for another, which says nothing about its
+    best psi.
 
     Raises:
         ValueError: no validation image shows an object.

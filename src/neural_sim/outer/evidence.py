@@ -13,9 +13,9 @@ from torch import Tensor
 class Average:
     """Weighted mean of derivatives by p, object by object; weights are inverse variances and decay as psi moves.
 
-    The weights keep noisy derivatives, which are long, and the first one from dominating. Two variances add up: that
-    over the images a derivative was computed from, and ``between``, the variance between trainings (with other initial
-    parameters, batches and images). A derivative with a component that is not finite is ignored.
+    The weights keep noisy derivatives, which are long, and the first one from dominating. A derivative's variance is
+    the sum of the variance over the images it was computed from and ``between``, the variance between trainings (which
+    differ in initial parameters, batches and images). A derivative with a component that is not finite is ignored.
 
     Attributes:
         directions: the derivatives.
@@ -47,17 +47,17 @@ class Average:
         )
 
     def moved(self, objects: Bool[Tensor, "objects"]) -> Average:
-        """Let the derivatives of those ``objects`` that have moved decay."""
+        """Decay the derivatives of the ``objects`` that have moved."""
         return replace(self, moves=self.moves + objects.long())
 
     @property
     def between(self) -> Float[Tensor, "objects"]:
         """Variance of a component between trainings; 0 if no object has two derivatives at one psi.
 
-        It is estimated from an object's derivatives at one psi, as their scatter beyond that of their images. The
-        median object's ratio of the two is added for each object as if it were one more pair of derivatives. It is a
-        ratio because objects' derivatives differ in size, and a median so that one object with wildly scattered
-        derivatives does not hide those of the others.
+        It is estimated from the scatter of an object's derivatives at one psi, less their variance over images. A
+        prior counts as one more pair of derivatives for each object: the median, over objects, of the ratio of the
+        variance between trainings to that over images. It is a ratio because objects' derivatives differ in size, and
+        a median so that one object with wildly scattered derivatives does not mask the others.
         """
         excess, freedom = self._excess
         if not bool((freedom > 0).any()):
@@ -73,7 +73,7 @@ class Average:
 
     @property
     def _excess(self) -> tuple[Float[Tensor, "objects"], Float[Tensor, "objects"]]:
-        """Squared deviations of derivatives from their mean at one psi, beyond those of images; degrees of freedom."""
+        """Squared deviations of derivatives from their mean at one psi, less image noise, and degrees of freedom."""
         known = self.variances.isfinite().all(2)
         excess = torch.zeros_like(self.directions[:1].sum((0, 2)))
         freedom = torch.zeros_like(excess)
@@ -115,8 +115,8 @@ class Average:
     def p_values(self) -> Float[Tensor, "objects"]:
         """P-values of the null hypothesis that all components of the mean are equal.
 
-        They come from a chi-square test with k - 1 degrees of freedom, each component divided by its own variance. 1
-        without observations, 0 without noise.
+        They come from a chi-square test with k - 1 degrees of freedom, with components weighted by their inverse
+        variances. A p-value is 1 without observations and 0 without noise.
         """
         value, variance = self.value, self.variance
         exact = (variance == 0.0).all(1)

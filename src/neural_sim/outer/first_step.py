@@ -39,7 +39,7 @@ class FirstStep(Protocol):
         """Propose a psi.
 
         Args:
-            scene: draws images of all bins; if the loop has a pool, without rendering.
+            scene: draws images of all bins, without rendering if the loop has a pool.
             images: labelled images of the target.
             psi: the loop's present psi.
             generator: the source of all random numbers.
@@ -49,10 +49,10 @@ class FirstStep(Protocol):
 
 @dataclass(frozen=True)
 class WhatTheTargetShows(FirstStep):
-    """Proposes the psi that the target's boxes show.
+    """Proposes the psi that is estimated from the target's boxes.
 
     Attributes:
-        settings: how psi is estimated from them.
+        settings: settings of the estimate.
         groups: bins that look the same.
         whole: use whole images, because there are no boxes.
     """
@@ -86,6 +86,6 @@ def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:
 
 
 def read_objects(factors: Sequence[FactorEstimate]) -> set[str]:
-    """Return the names of the objects all of whose factors were read, whether psi moves to the estimate or stays."""
+    """Return the names of the objects for which every factor has an estimate, whether psi moves there or stays."""
     unread = {one.name for one in factors if one.finding not in ("moves", "stays")}
     return {one.name for one in factors} - unread

@@ -32,7 +32,7 @@ from neural_sim.types import LabelledImages
 
 @contextmanager
 def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterator[None]:
-    """Add the seconds spent inside, including the device's work, to those of a phase."""
+    """Add the time spent in the block, including the device's work, to a phase's seconds."""
     begin = time.perf_counter()
     yield
     synchronise(device)
@@ -46,7 +46,7 @@ def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bo
 
 @dataclass(frozen=True)
 class Numbers:
-    """The random numbers of trainings.
+    """The source of random numbers of trainings.
 
     Attributes:
         generator: the loop's generator.
@@ -73,8 +73,8 @@ class RenderedPool:
 
     Attributes:
         scene: the scene of the pooled renders.
-        state: the generator's state after them: whoever continues from it draws what the pool's maker would draw next.
-        spent: seconds that it took.
+        state: the generator's state after them, so that a loop given this pool continues with the same draws.
+        spent: cost of rendering them.
     """
 
     scene: Scene
@@ -97,7 +97,7 @@ class LoopInputs:
 
     Attributes:
         detector: the detector.
-        params: its warm start, on the device on which the loop trains and the scene's fields are.
+        params: its warm start, on the device of the scene's fields, where the loop trains.
         validation: the labelled validation set, on any device; the loop sees no other images of the target.
         photographs: labelled photographs that train with the drawn images, as ``training.real`` says.
         pool: a pool that was already rendered by the loop's generator; None: the loop renders its own if it needs one.
@@ -112,7 +112,7 @@ class LoopInputs:
 
 @dataclass(frozen=True)
 class Trained:
-    """A detector after training on images at one psi, or a detector that was trained elsewhere, with these images.
+    """A detector trained on images drawn at one psi, or a detector trained elsewhere, paired with such images.
 
     Attributes:
         psi: the psi from which the images were drawn.
@@ -160,20 +160,20 @@ class InnerLoop:
 
     The backbone is the one in ``params``, frozen except for its last ``settings.loop_layers`` stages. These stages, the
     pyramid and the head are trained for ``settings.epochs`` epochs at a time, or more if ``settings.least_steps``
-    requires it. Relaxed draws, and images under a light that moves, are always rendered anew; all others come from a
-    pool of poses of every bin.
+    requires it. Relaxed draws, and images whose light is learned, are rendered for every training; all others come from
+    a pool of poses in every bin.
 
     Attributes:
         scene: the scene from which images are drawn.
         detector: the detector as the loop trains it.
         params: its warm start.
-        start: where a training begins, unless it continues the previous one.
+        start: initial parameters of a training that does not continue the previous one.
         objective: L_val.
         photographs: the photographs that train with the drawn images.
         settings: settings of the psi loop.
         training: batch size and weight decay.
         draws: how the method draws images.
-        pool: the scene of poses that are rendered once, if there is one.
+        pool: the scene with poses that were rendered once, if there is one.
         preparation: cost of rendering the pool.
     """
 
@@ -275,8 +275,8 @@ class InnerLoop:
         Args:
             psi: the images are drawn from p_psi.
             numbers: random numbers of the draws and the training.
-            theta: where a training continues if ``settings.start=previous``; None: at the warm start.
-            recording: which part of the steps is recorded.
+            theta: initial parameters if ``settings.start=previous``; None: the warm start.
+            recording: which of the steps are recorded.
         """
         theta = self.params if theta is None else theta
         seconds: dict[str, float] = {}
@@ -288,7 +288,7 @@ class InnerLoop:
         return self._trained(psi, rendered, examples, theta, seconds, history)
 
     def untrained(self, psi: Float[Tensor, "objects K"], numbers: Numbers, theta: Parameters) -> Trained:
-        """Draw images at psi for a detector that was trained elsewhere; the loss is evaluated on them."""
+        """Draw images at psi for a detector that was trained elsewhere, and evaluate its loss on them."""
         seconds: dict[str, float] = {}
         rendered, examples = self._examples(psi, numbers, seconds)
         with timed(seconds, "train", self.device):

@@ -35,10 +35,10 @@ logger = logging.getLogger(__name__)
 class OuterLoop(pl.LightningModule):
     """psi [objects, K] with all factors of p_psi; one training step is one of ``rounds`` outer iterations.
 
-    ``inner`` draws an iteration's images and trains the detector on them with the random ``numbers``; ``theta`` is
-    where a training continues if it follows the previous one. A subclass's ``training_step`` ends with ``record``;
-    after psi's step it appends the method's result, as if the loop ended here, to ``trajectory``. ``shown`` is what the
-    target's boxes showed, if they were read.
+    ``inner`` draws an iteration's images and trains the detector on them with the random ``numbers``; ``theta`` has
+    the parameters of the last training, from which the next may continue. A subclass's ``training_step`` ends with
+    ``record``; after the step of psi, it appends to ``trajectory`` the psi that the method would return at this point.
+    ``shown`` is the estimate from the target's boxes, if one was made.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class OuterLoop(pl.LightningModule):
         return self.charged(self.inner.train(psi, self.numbers, self.theta, recording))
 
     def charged(self, trained: Trained) -> Trained:
-        """Continue from a training, and add its cost to the iteration's."""
+        """Keep a training's parameters as ``theta``, and add its cost to the iteration's."""
         self.theta = trained.theta
         self.charge(trained.cost)
         for phase, spent in trained.seconds.items():
@@ -125,7 +125,7 @@ class OuterLoop(pl.LightningModule):
         self._cost = self._cost + cost
 
     def timed(self, phase: str) -> AbstractContextManager[None]:
-        """Add the seconds spent inside to the phase's seconds in this iteration."""
+        """Add the time spent in the block to the phase's seconds in this iteration."""
         return timed(self._seconds, phase, self.inner.device)
 
     def record(
@@ -246,6 +246,6 @@ def learn_psi(
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
         if not module.ended:
-            # psi and its records are a few numbers: they stay on the CPU, wherever images and detector are.
+            # psi and its records are a few numbers, which stay on the CPU whatever the run's device is.
             trainer_on(torch.device("cpu")).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records, shown=module.shown)

@@ -28,8 +28,8 @@ class Objective:
     Attributes:
         cached: the validation images' features.
         images: the boxes of the same images.
-        score: what is minimised: the images' mean loss; or one minus the mean over classes of this smooth score, plus
-            its ``loss`` times that mean loss.
+        score: what is minimised: with ``Loss``, the images' mean loss; with a smooth score, one minus its mean over
+            classes, plus its weight ``loss`` times the mean loss.
     """
 
     cached: CachedSet
@@ -62,7 +62,7 @@ class Objective:
         return 1.0 - score.sum(1).nanmean() + self.score.loss * loss
 
     def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
-        """Run the detector on all images. A derivative recomputes intermediate values chunk by chunk."""
+        """Run the detector on all images. A backward pass recomputes intermediate values chunk by chunk."""
         parts = [
             checkpoint(self.cached.outputs, params, rows, use_reentrant=False)
             for rows in torch.arange(len(self.cached), device=self.cached.device).split(chunk_size)

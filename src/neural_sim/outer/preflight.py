@@ -24,14 +24,14 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ExpectedGains:
-    """The expected fall of L_val from moving one object's psi of one factor, to first order.
+    """The fall of L_val to be expected, to first order, from moving one object's psi in one factor.
 
     Attributes:
         name: the object.
         factor: the factor of psi.
         p_value: p-value of the null hypothesis that the derivative is zero.
         moved: fraction of the object's images that moves to a bin.
-        by_bin: fall of L_val when they move to each bin (or light) and all others lose in proportion.
+        by_bin: fall of L_val if they move to each bin (or light), while all other bins lose in proportion.
         by_bin_error: standard errors of ``by_bin``.
         step: fall of L_val from a step of the loop along the derivative.
         step_error: standard error of ``step``.
@@ -77,7 +77,7 @@ def gains_of(
     moved: float,
     region: TrustRegion,
 ) -> list[ExpectedGains]:
-    """Average derivatives at one psi, and step within ``region``; for other arguments see ``expected_gains``."""
+    """Average derivatives at one psi, and compute the gains of a step in ``region``; see ``expected_gains``."""
     parts, found = distribution.split(psi), []
     for factor in distribution.factors:
         own = parts[factor.name]
@@ -110,7 +110,7 @@ def _along(change: Tensor, direction: Tensor, variance: Tensor) -> tuple[Tensor,
 
 @dataclass(frozen=True)
 class PhotographGain:
-    """How far L_val falls when photographs train together with images of the initial distribution.
+    """How far L_val falls when photographs are added to training images of the initial distribution.
 
     Attributes:
         photographs: number of photographs.
@@ -162,7 +162,7 @@ def _gain(count: int, without: Sequence[float], with_them: Sequence[float]) -> P
 
 
 def equivalent(gains: Sequence[PhotographGain], fall: float) -> float | None:
-    """Return the number of photographs at which L_val falls this far, interpolated linearly; None: more than tried."""
+    """Interpolate the number of photographs at which L_val falls this far; None: more than were tried."""
     before = PhotographGain(0, 0.0, None)
     for gain in sorted(gains, key=lambda g: g.photographs):
         if gain.fall >= fall:

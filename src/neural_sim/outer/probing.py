@@ -78,7 +78,7 @@ class ProbeSet:
         return ProbeSet(probes, CachedSet(detector, features, targets), state["per_bin"])
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
-        """Replace the next ``fresh.per_bin`` probes of every bin, in a cycle that the iteration ``turn`` positions.
+        """Replace ``fresh.per_bin`` probes of every bin, at the places whose turn it is in the iteration ``turn``.
 
         Raises:
             ValueError: there are more fresh probes for a bin than places.

@@ -1,4 +1,4 @@
-"""Results of an outer loop: one record an iteration, and the trajectory of psi."""
+"""Results of an outer loop: one record per iteration, and the trajectory of psi."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from neural_sim.outer.way import TakenBack
 class Cost:
     """Cost of a method or a training.
 
-    Labelled images, optimiser steps of detectors, Hessian products, seconds of wall-clock time and processor seconds
-    over all cores.
+    It consists of labelled images, optimiser steps of detectors, Hessian products, seconds of wall-clock time, and
+    processor seconds over all cores.
     """
 
     images: int = 0
@@ -41,7 +41,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an iteration's trainings decided about steps.
+    """The decisions of an iteration's trainings about steps.
 
     Attributes:
         verdicts: verdicts on the objects whose last step was accepted or rejected.
@@ -60,8 +60,8 @@ class IterationRecord:
     were drawn, before the step. ``gradient_norms`` and ``gradient_errors`` are, by object, the norms of dL_val/dpsi and
     of its standard errors; empty without a derivative. ``images`` counts labelled images, probes included,
     ``detector_steps`` optimiser steps and ``products`` Hessian products. ``seconds`` are wall-clock times by phase;
-    ``cpu_seconds``, the processor time over all cores, is disturbed less by other processes on the machine.
-    ``certificate`` is None for methods without a hypergradient, and in an iteration that takes none. ``scores``
+    ``cpu_seconds``, the processor time over all cores, is affected less by other processes on the machine.
+    ``certificate`` is None for methods without a hypergradient, and in an iteration that computes none. ``scores``
     [classes] are the scores of the loop's objective; higher is better. For ``verdicts`` and ``taken_back`` see
     ``Outcome``.
     """
@@ -117,9 +117,9 @@ class LearnedPsi:
     """The result of the loop.
 
     ``trajectory`` has the method's psi before the first iteration and after each. A trust-region step enters it at once
-    and is undone an iteration later if it is rejected; the last entry has the best psi that every object has had.
-    ``before`` is the cost before the first iteration: the warm start, whose backbone every loop uses, or the estimate
-    of ``shown`` by a method that reads psi off the target.
+    and is undone an iteration later if it is rejected; the last entry has the best psi of every object.
+    ``before`` is the cost before the first iteration: that of the warm start, whose backbone every loop uses, or of the
+    estimate ``shown`` for a method that estimates psi from the target.
     """
 
     trajectory: Float[Tensor, "psis objects K"]
@@ -128,7 +128,7 @@ class LearnedPsi:
     shown: tuple[FactorEstimate, ...] = ()
 
     def cost(self, iterations: int) -> Cost:
-        """Sum up the cost up to the given number of iterations; zero for none, because psi is then given."""
+        """Sum up the cost up to the given number of iterations; zero for none, because the initial psi is free."""
         return sum(
             (cost_of(record) for record in self.records[:iterations]), self.before if iterations else Cost()
         )

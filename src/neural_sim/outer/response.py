@@ -1,6 +1,6 @@
 """The finite-difference response of training: how an object's score changes when its images move to one bin.
 
-No derivative is taken. The training is repeated, with common random numbers, once for each bin of a factor. Each run
+No derivative is computed. The training is repeated, with common random numbers, once for each bin of a factor. Each run
 moves all objects at once, each to a different bin, and measures each object's response by its score. The response is
 the reference for hypergradients of the loop's training, and a method of its own (``baseline=response``). It costs one
 training for each bin.
@@ -72,7 +72,7 @@ def response(
         inner: the inner problem.
         psi: where the response is measured.
         numbers: random numbers that the trainings share.
-        theta: where each training continues if ``outer.start=previous``.
+        theta: initial parameters of each training if ``outer.start=previous``.
         part: fraction of an object's images that move.
 
     Raises:
@@ -106,7 +106,8 @@ def agreement(
     """Compare derivatives at ``psi`` with the ``slopes`` of the response.
 
     Returns:
-        The cosine of the centred derivatives by p, averaged over learned objects and factors; None if one vanishes.
+        The cosine of the centred derivatives by p, averaged over learned objects and factors; None if all of them
+        vanish.
     """
     distribution = objects.distribution
     truth = distribution.split(slopes)

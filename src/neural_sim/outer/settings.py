@@ -34,9 +34,9 @@ class Outer:
         images_per_object: number of training images of each object in an iteration.
         epochs: epochs of an iteration's training.
         learning_rate: peak learning rate of that training.
-        least_steps: least optimiser steps of that training; its epochs are raised to reach them. The images of one or
-            two objects fill few batches, and such a short training says little about psi. Does not apply to a training
-            that continues the previous iteration's.
+        least_steps: minimum number of optimiser steps of that training; its epochs are raised to reach it. The images
+            of one or two objects fill few batches, and such a short training says little about psi. Does not apply to a
+            training that continues the previous iteration's.
         loop_layers: number of last stages of the detector's backbone that this training changes, starting from the warm
             start's values; the others are frozen. None: as many as the detector proposes (``Detector.in_loop``).
         start: initial pyramid and head of that training: those of the previous iteration (``previous``, the paper's),
@@ -45,7 +45,7 @@ class Outer:
             alone.
         train_first: train before the first hypergradient; otherwise it is taken at the warm start.
         pool_per_bin: number of poses of every bin that are rendered once and then composited onto new backgrounds; 0:
-            every image is rendered anew, as is always the case for the pathwise estimator, which replays exact draws.
+            every image is rendered for itself, as always with the pathwise estimator, which replays exact draws.
         refresh: fraction of the probes that an iteration replaces. The others keep their images, with the values that
             the other factors of p_psi had when they were drawn.
         quality: quality of the loop's renders; None: the renderer's own, which the scored detectors always train on.
@@ -54,11 +54,11 @@ class Outer:
         certify_every: number of iterations between comparisons of the hypergradient with the finite-difference response
             of training at the same psi (``outer.response``, one training for each bin); 0: never.
         refine: which objects take steps along derivatives after the first step: ``all``, or only those that it could
-            not read or whose reading a training rejected (``unread``).
-        first_step: how the psi that is tried first is proposed: by the first derivative, or by what the target's boxes
-            show.
-        steps: how psi follows its derivative: freely, or in a trust region, under common random numbers, where the last
-            iteration only trains, to accept or reject the last step.
+            not estimate or whose estimate a training rejected (``unread``).
+        first_step: how the loop chooses the psi that it tries first: along the first derivative, or by an estimate from
+            the target's boxes.
+        steps: how psi follows its derivative: freely, or in a trust region. The latter uses common random numbers, and
+            its last iteration only trains, to accept or reject the last step.
         adjoint: the hypergradient of the training that was run, or that at a stationary point (the paper's Eq. 2).
         objective: what is minimised on the validation images: one minus a smooth average precision, or a classifier's
             smooth accuracy, or their loss (the paper's).

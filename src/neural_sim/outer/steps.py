@@ -38,13 +38,13 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A psi of all objects that is proposed without a derivative.
+    """A psi for all objects, proposed without a derivative.
 
     Attributes:
         psi: the proposed psi; for an object that should stay, its present one.
-        p_values: by object, of the null hypothesis that the present psi is right.
+        p_values: p-values, by object, of the null hypothesis that the present psi is right.
         images: number of images that were composed for it.
-        shown: the estimate of what the target's boxes show, from which psi follows.
+        shown: the estimate from the target's boxes on which psi is based.
     """
 
     psi: Float[Tensor, "objects K"]
@@ -63,14 +63,14 @@ class LearnedObjects:
 
 
 class Steps(Protocol):
-    """Present psi [objects, K] of the learned objects, and what is known for the next step.
+    """Present psi [objects, K] of the learned objects, and the evidence for the next step.
 
     Immutable: ``judge``, ``observe`` and ``propose``, called in this order, each return a new state.
     """
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
-        """The loop's result, as psi, if it ends now."""
+        """The psi that the loop would return if it ended now."""
         ...
 
     @property
@@ -86,21 +86,21 @@ class Steps(Protocol):
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> tuple[Self, dict[str, Verdict]]:
-        """Accept or reject the pending step by trainings before and after it.
+        """Accept or reject the pending step by the scores of trainings ``before`` and ``after`` it.
 
-        Scores are each validation image's contributions to the score of each class; higher is better.
+        They are each validation image's contributions to the score of each class; higher is better.
         """
         ...
 
     def observe(self, result: Hypergradient) -> tuple[Self, PValues]:
         """Add a derivative at ``reported``.
 
-        The p-values test the null hypothesis that the derivative which steps follow is zero.
+        The p-values test the null hypothesis that the derivative that steps follow is zero.
         """
         ...
 
     def propose(self, certificate: Certificate, shrink: float) -> Self:
-        """Take the next step; ``shrink`` is the fraction of a shrunk one."""
+        """Take the next step; a shrunk step is taken by the fraction ``shrink``."""
         ...
 
 
@@ -219,8 +219,8 @@ def slopes_by_p(
 ) -> tuple[Float[Tensor, "objects k"], Float[Tensor, "objects k"]]:
     """Convert the derivative of L_val by psi to the derivative of minus L_val by a factor's p, centred.
 
-    The derivative by logits is (p - floor) times the one by p, and would hardly move a bin of small p. ``error`` has
-    the standard errors of ``gradient``; the second result has the variances of the first.
+    The derivative by logits is (p - floor) times the one by p, so that it would hardly move a bin of small p. ``error``
+    has the standard errors of ``gradient``; the second result has the variances of the first.
     """
     scale = (
         factor.log_slopes(psi).exp().clamp_min(torch.finfo(psi.dtype).tiny)

@@ -9,10 +9,10 @@ rejected (Conn, Gould and Toint 2000, Chapter 6, with the reduction measured obj
 last case: the noise of a training does not shrink with the step, so that chance would decide even more about a much
 shorter step.
 
-A step goes to the p nearest to p + t direction at the distance of the radius from p, where bins of equal value gain
-equally. (Along logits, a bin gains in proportion to its p, and likely bins take nearly everything.) A bin keeps a
-fraction of its p: the score is concave in the number of a bin's images, so that the derivative, which is linear, says
-little about having none.
+A step goes to the distribution nearest to p + t direction, with t chosen so that its distance from p is the radius;
+bins of equal value gain equally. (Along logits, a bin gains in proportion to its p, and likely bins take nearly
+everything.) A bin keeps a fraction of its p: because the score is concave in the number of a bin's images, the
+derivative, which is linear, says little about having none.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ class TrustRegion:
         errors: number of standard errors by which an object's score must rise for its radius to grow, and fall for it
             to shrink by the whole factor.
         waits_below: an object does not move by a factor if its expected gain is below this fraction of the iteration's
-            largest one: it waits until the large steps are done. Its derivative belongs to a training with the other
-            objects' present errors, and changes once they have moved.
-        take_back: whether at the end every object goes back to the best psi that it has had, by the mean of all
-            trainings that saw each (``outer.way``); otherwise the last psi is the result.
+            largest one: it waits until the large steps are done. Its derivative was measured with the other objects'
+            psi still wrong, and changes once they have moved.
+        take_back: whether at the end every object goes back to the best psi that it has had, judged by all trainings
+            that saw it (``outer.way``); otherwise the last psi is the result.
         grow: factor on the radius after an accepted step that raised the score.
         shrink: factor on the radius after a step that lowered the score; its square root after another rejected step.
         momentum: factor on a derivative's weight in the average for every later move of its object.
@@ -131,9 +131,9 @@ class TrustRegionSteps:
         expected: expected gain of the pending step.
         significance: significance, in standard deviations, of the derivatives or the proposal by which the pending step
             moved an object.
-        at_rest: for each judgement, the variance between trainings: the mean square of what objects that did not move
-            gained or lost, less the error over images.
-        offered: objects that the pending step moved to a proposal; their radii are meant for steps, and stay.
+        at_rest: for each judgement, the variance between trainings: the mean squared gain of the objects that did not
+            move, less the error over images.
+        offered: objects that the pending step moved to a proposal, which leaves their radii as they are.
     """
 
     settings: TrustRegion
@@ -161,7 +161,7 @@ class TrustRegionSteps:
 
     @property
     def waiting(self) -> set[tuple[str, str]]:
-        """Pairs of object and factor with too small a radius, or a small gain compared with the largest one."""
+        """Pairs of object and factor whose radius is too small, or whose gain is small compared with the largest."""
         return {
             (name, factor)
             for factor, moved in self.moved.items()
@@ -341,7 +341,7 @@ def step_within(
 def _between_trainings(at_rest: tuple[float, ...]) -> float:
     """Return the variance of a gain between trainings.
 
-    It is the median over judgements, because large steps make other objects at rest really gain by better images.
+    It is the median over judgements, because a large step of one object can really change the scores of those at rest.
     """
     return max(median(at_rest), 0.0) if at_rest else 0.0
 

@@ -1,9 +1,9 @@
-"""The sequence of psi that an object has had, and which of them a loop returns.
+"""The sequence of psi that each object has had, and the choice of the one that a loop returns.
 
-Trainings scatter, and a step is judged by a single pair of them: a small loss may be accepted, and a loss that shows
-only over later trainings is never seen. At the end, every accepted psi is therefore scored again by all the trainings
-that saw it. The largest of several noisy means is too often a lucky one; so the values m_v of an object's psi are
-fitted to the scores y_t of its trainings under the assumption that neighbours on the way are worth about the same:
+Scores scatter between trainings, and a single pair of trainings judges a step: a slightly harmful step may be accepted,
+and harm that shows only over later trainings goes unnoticed. At the end, every accepted psi is therefore scored again
+by all the trainings that saw it. The largest of several noisy means is too often a lucky one; so the values m_v of an
+object's psi are fitted to the scores y_t of its trainings, assuming that successive psi have similar values:
 
     minimise over m    sum_t (y_t - m_v(t))^2 + w sum_v f(m_v - m_(v-1)),    f(x) = c^2 log(1 + x^2 / c^2)
 
@@ -48,7 +48,7 @@ class TakenBack:
     """An object that goes back to an earlier psi at the end.
 
     Attributes:
-        kept: number of its accepted steps that are kept; 0: it goes back to the start.
+        kept: number of its accepted steps that are kept; 0: it goes back to the initial psi.
         accepted: number of all its accepted steps.
         gain: estimated gain in score of the returned psi over the last one.
     """
@@ -70,7 +70,7 @@ class Way:
         return Way({name: (Stay(row.clone()),) for name, row in zip(names, psi, strict=True)})
 
     def moved(self, name: str, psi: Float[Tensor, "K"]) -> Way:
-        """Add another psi, to which an object has moved."""
+        """Add the psi to which an object has moved."""
         return self._with(name, (*self.stays[name], Stay(psi.clone())))
 
     def settled(self, names: Collection[str]) -> Way:
@@ -117,7 +117,7 @@ class Way:
 def fitted_scores(
     scores: Sequence[Sequence[float]], variance: float, weight: float = WEIGHT
 ) -> Float[Tensor, "stays"]:
-    """Estimate the worth of each psi on an object's way, by iteratively reweighted least squares.
+    """Estimate the score of each psi on an object's way, by iteratively reweighted least squares.
 
     Args:
         scores: scores of the trainings that saw each psi; at least one for every psi.
