@@ -1,8 +1,8 @@
-"""Average precision, or accuracy, under image weights: the same matches resampled, without evaluating anew.
+"""Average precision and accuracy under image weights, for a bootstrap that evaluates each detector only once.
 
-A detection's match depends on its own image only. Drawing images with replacement therefore only changes how often
-each detection and each box counts, and AP is a weighted sum over the detections in the order of their scores. Accuracy
-is a weighted mean over images.
+Whether a detection is matched depends on its own image only. Drawing images with replacement therefore only changes how
+often each detection and each box counts. AP is then a weighted sum over detections in the order of their scores, and
+accuracy a weighted mean over images.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from neural_sim.detector.metrics import best_classes
 from neural_sim.detector.protocol import Score
 from neural_sim.types import LabelledImages
 
-# In float32, as torchmetrics hands them on: a recall of exactly 0.28 falls on one side or the other of 0.28.
+# Rounded to float32 as in torchmetrics, because it decides on which side of 0.28 a recall of exactly 0.28 falls.
 THRESHOLDS = torch.linspace(0.5, 0.95, 10).double().numpy()
 RECALLS = torch.linspace(0.0, 1.0, 101).double().numpy()
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Detections of one class over a set, best first, and whether each is right at each of the COCO overlaps."""
+    """Detections of one class in a test set, best first, and whether each is correct at each COCO threshold."""
 
     image: Int[np.ndarray, "detections"]
     correct: Bool[np.ndarray, "detections thresholds"]
@@ -43,20 +43,21 @@ class Hits:
 
 
 Outcomes = Matches | Hits
-"""What the score of one class over a set is computed from."""
+"""The outcomes from which the score of one class in a test set is computed."""
 
 
 def match(
     predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int, score: Score = "AP"
 ) -> Outcomes:
-    """Return what the score of one class is computed from.
+    """Compute the outcomes from which the score of one class is computed.
 
-    For AP by COCO's rules: an image's best detection first, each to the free box that it overlaps most.
+    For AP, detections are matched by COCO's rules: in each image from the best on, each to the unmatched box with
+    which it overlaps most.
 
     Args:
-        predictions: of every image.
+        predictions: the predictions on every image.
         images: the images with their boxes.
-        label: of the class.
+        label: the class.
         score: AP or accuracy.
     """
     if score == "accuracy":
@@ -70,7 +71,7 @@ def match(
         order = detections["scores"][own].argsort(descending=True, stable=True)[:100]
         if len(truth):
             overlap = box_iou(detections["boxes"][own][order].float(), truth.float()).numpy()
-        else:  # most images of another object
+        else:  # a shortcut, because most images show other objects
             overlap = np.zeros((len(order), 0))
         rows += [index] * len(order)
         scores += detections["scores"][own][order].tolist()
@@ -95,7 +96,7 @@ def _greedy(overlap: Float[np.ndarray, "detections boxes"]) -> Bool[np.ndarray, 
 
 
 def class_score(outcomes: Outcomes, weights: Float[np.ndarray, "images"] | None = None) -> float:
-    """Return the score of one class; ``weights`` say how often each image counts. nan without a box."""
+    """Return the score of one class, nan without a box; ``weights`` say how often each image counts."""
     if isinstance(outcomes, Matches):
         return average_precision(outcomes, weights)
     shown = outcomes.boxes_per_image * (1.0 if weights is None else weights)
@@ -104,7 +105,7 @@ def class_score(outcomes: Outcomes, weights: Float[np.ndarray, "images"] | None 
 
 
 def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | None = None) -> float:
-    """Return AP over COCO's overlaps with 101 recalls, nan without a box; ``weights``: how often each image counts."""
+    """Return AP from 101 recalls, averaged over COCO's thresholds; nan without a box. ``weights`` weigh the images."""
     weights = np.ones(len(matches.boxes_per_image)) if weights is None else weights
     boxes = float((weights * matches.boxes_per_image).sum())
     if boxes == 0.0:
@@ -124,10 +125,10 @@ def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | N
 def class_scores(
     matches: Sequence[Sequence[Sequence[Outcomes]]], draws: int, seed: int = 0
 ) -> tuple[Float[np.ndarray, "groups rows classes"], Float[np.ndarray, "draws groups rows classes"]]:
-    """Return scores of ``matches`` [group][detector][class], as they are and under resampled test images.
+    """Return the scores of ``matches`` [group][detector][class], on the test images and on resampled ones.
 
-    Detectors scored on as many images have the same ones resampled, so that differences between those that share a
-    test set are paired.
+    All test sets of the same size are resampled alike, so that differences between detectors that share a test set are
+    paired.
     """
     random = np.random.default_rng(seed)
     counts = sorted({len(outcomes.boxes_per_image) for group in matches for row in group for outcomes in row})
@@ -145,7 +146,7 @@ def class_scores(
 
 
 def mean_of_known(scores: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
-    """Return the mean over the classes with a value; nan where none has one."""
+    """Return the mean over the classes that have a score; nan if none has one."""
     known = ~np.isnan(scores)
     counts = known.sum(-1)
     return np.where(counts, np.where(known, scores, 0.0).sum(-1) / np.maximum(counts, 1), np.nan)

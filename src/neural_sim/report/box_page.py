@@ -1,4 +1,4 @@
-"""A page on which the box about a photographed object is dragged, and seen in the photographs.
+"""A page on which the user drags the box around a photographed object and sees it in the photographs.
 
 Needs viser (the extra ``viewer``).
 """
@@ -23,24 +23,24 @@ from neural_sim.objects.placing import nearest_to_axes
 from neural_sim.pictures import read_picture
 
 SHOWN = 640
-"""Pixels along a shown photograph's longer side."""
+"""Longer side of the photograph shown, in pixels."""
 SMALL = 64
-"""Along that of one at its camera."""
+"""Longer side of the thumbnails at the cameras, in pixels."""
 FIRST_SIZE = 0.25
-"""Half a side of the box that is shown first, in distances of the cameras from where they look."""
+"""Half a side of the initial box, relative to the cameras' median distance from the point they look at."""
 ORANGE = (230, 120, 0)
 EDGES = tuple(
     (a, b) for a, b in itertools.combinations(range(8), 2) if (a ^ b).bit_count() == 1
-)  # of corners whose numbers' bits say low or high
+)  # pairs of corners that differ in one bit, see ``corners_of``
 
 
 def corners_of(box: Corners) -> Float[np.ndarray, "8 3"]:
-    """Return the eight corners; bit k of a corner's number says whether it is high along axis k."""
+    """Return the eight corners; bit k of a corner's index says whether it is at the high end of axis k."""
     return np.array([[box[number >> axis & 1][axis] for axis in range(3)] for number in range(8)])
 
 
 def first_box(capture: Capture) -> Corners:
-    """Return a box about where the cameras look."""
+    """Return a box around the point that the cameras look at."""
     poses = np.stack([frame.camera_to_world for frame in capture.frames])
     centre = nearest_to_axes(poses)
     half = FIRST_SIZE * float(np.median(np.linalg.norm(poses[:, :3, 3] - centre, axis=1)))
@@ -64,13 +64,13 @@ def drawn(frame: Frame, box: Corners) -> UInt8[np.ndarray, "height width 3"]:
 
 @dataclass
 class BoxPage:
-    """The cameras with their photographs, a box with two corners to drag, and the box in a chosen photograph.
+    """The page: the cameras with their photographs, a box with two corners to drag, and the box in one photograph.
 
     Args:
         capture: the photographs and their cameras.
-        box: the box that is shown first.
-        save: is given the box when the button is pressed, and says what became of it.
-        port: of the page, on this machine's own address alone; the next free one where it is taken.
+        box: the initial box.
+        save: called with the box when the button is pressed; returns a message for the page.
+        port: the page's port, on this machine's own address only; the next free one if it is taken.
 
     Raises:
         ValueError: viser is missing.
@@ -113,11 +113,11 @@ class BoxPage:
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """The page's address."""
         return f"http://127.0.0.1:{self.server.get_port()}"
 
     def moved(self) -> None:
-        """Take the box from the corners."""
+        """Read the box off the dragged corners."""
         self.box = _sorted(*(np.asarray(handle.position) for handle in self.handles))
         self.show()
 
@@ -130,7 +130,7 @@ class BoxPage:
         self.image.image = drawn(self.capture.frames[number - 1], self.box)
 
     def saved(self) -> None:
-        """Save the box."""
+        """Save the box, and show the message that results."""
         self.told.content = self.save(self.box)
 
     def _show_cameras(self, scale: float) -> None:

@@ -28,10 +28,10 @@ def result_rows(
     """Return COCO's result rows of one image, bbox as (x, y, width, height) in pixels.
 
     Args:
-        found: the detections; boxes without scores count 1.
+        found: the detections; boxes without scores get the score 1.
         image_id: the image's id.
-        category_ids: ids by label, and a class without one has no rows; None: the label plus 1.
-        rounded: round boxes to 0.001 pixels and scores to five digits; else the rows score what the detections do.
+        category_ids: ids by label; a class without an id gets no rows. None: the label plus 1.
+        rounded: round boxes to 0.001 pixels and scores to five digits; otherwise the rows keep every digit.
     """
     scores = found.get("scores", torch.ones(len(found["labels"])))
     rows = []
@@ -65,7 +65,7 @@ def write_detections(
 
 
 def read_detections(file: Path) -> tuple[LabelledImages, dict[str, list[Detections]]]:
-    """Read what ``write_detections`` wrote: the test set without pixels, and the detections of every detector."""
+    """Read detections.json: the test set without pixels, and the detections of every detector."""
     stored = json.loads(file.read_text(encoding="utf-8"))
     count = stored.pop("images")
     by_image = {which: _by_image(rows, count) for which, rows in stored.items()}
@@ -94,7 +94,7 @@ def _by_image(rows: Sequence[Mapping[str, Any]], count: int) -> list[Detections]
 
 
 def write_training_set(rendered: RenderedImages, names: Sequence[str], folder: Path) -> Path:
-    """Write the final training set as COCO: images and a JSON that holds the pose of every object in them."""
+    """Write the final training set as COCO: images, and a JSON file that includes the pose of every object."""
     poses: list[list[dict[str, Any]]] = [[] for _ in range(len(rendered))]
     for label, (part, rows) in enumerate(zip(rendered.objects, rendered.rows, strict=True)):
         draw, distance = part.draw, part.draw.distance / part.draw.radius  # object radii

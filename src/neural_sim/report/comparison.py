@@ -1,4 +1,4 @@
-"""Methods of one setting side by side: what they score at the end, at equal time and on the way, and who is ahead."""
+"""Compare the methods of one setting: their scores at the end, at equal cost and over time, and which one leads."""
 
 from __future__ import annotations
 
@@ -16,42 +16,42 @@ from neural_sim.report.intervals import Estimate, over_seeds
 from neural_sim.report.runs import BOUNDS, FinishedRun, common_seeds, methods_of, score_table
 
 BUDGETS = 6
-"""Seconds at which the methods are compared, evenly spaced in their logarithm."""
+"""Number of times at which the methods are compared, evenly spaced in log seconds."""
 ONLY_AT_END = (
     "Some runs were scored at their end alone and count as their start until then, so that areas, and scores and leads "
     "after fewer seconds, do not tell who is ahead: score_at=[0.25,0.5] scores a run on its way, too."
 )
 SPENT = ("images", "detector_steps", "products")
 Clock = Literal["seconds", "cpu_seconds"]
-"""What a method has taken: by the clock on the wall, or of all processor cores together."""
+"""How a method's time is measured: wall-clock seconds, or processor seconds over all cores."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The methods of one setting over the seeds that all of them have.
+    """A comparison of the methods of one setting, over the seeds that all of them have.
 
-    Scores are means over the biased objects. What is read at fewer seconds than a run took does not tell who is ahead
-    where some run was scored at its end alone (``only_at_end``).
+    Scores are means over the biased objects. If some run was scored only at its end (``only_at_end``), values at fewer
+    seconds than a run took do not show which method leads.
 
     Args:
         setting: the experiment and its gap.
-        seeds: those that all methods have.
-        methods: the reference first.
+        seeds: the seeds that all methods have.
+        methods: the methods, the reference first.
         reference: the method that the others are compared with.
         ap: the score of every method and of ``bounds``.
-        won_back: the fraction of the gap from ns to matched that a method closes; empty without matched, and where the
-            start is the target's and there is no gap.
+        won_back: the fraction of the gap from ns to matched that a method closes; empty without matched, or if there is
+            no gap because the initial distribution is the target's.
         ahead: the reference's score minus each other method's.
-        area: the same of the areas under the score against log seconds, per unit of log seconds.
-        spent: what every method needed in all, with the warm start, means over seeds.
-        at_equal_cost: the score at the seconds that the cheapest method took in all, see ``ap_at``.
-        equal_cost: these seconds, their mean over seeds.
+        area: the same difference for the areas under the score against log seconds, per unit of log seconds.
+        spent: the total cost of every method, including the warm start, means over seeds.
+        at_equal_cost: the score after as many seconds as the cheapest method took in total, see ``ap_at``.
+        equal_cost: these seconds, averaged over seeds.
         budgets: seconds from the first scored iteration of any run to the last.
         ahead_at: the reference's lead over each other method at each of ``budgets``; a method that has ended by then
             keeps its last score.
-        clock: which seconds.
-        score: what detectors are scored by.
-        only_at_end: whether some run was scored once.
+        clock: how seconds are measured.
+        score: the kind of score.
+        only_at_end: whether some run was scored only once.
     """
 
     setting: str
@@ -73,12 +73,12 @@ class Comparison:
 
     @property
     def several(self) -> bool:
-        """Whether intervals are over seeds, so that differences that leave 0 out exceed the spread."""
+        """Whether intervals are over seeds, so that a difference whose interval excludes 0 exceeds their scatter."""
         return len(self.seeds) > 1
 
     @property
     def timed(self) -> bool:
-        """Whether differences at fewer seconds than a run took exceed the spread where they leave 0 out."""
+        """Whether the same holds for differences at fewer seconds than a run took."""
         return self.several and not self.only_at_end
 
     @property
@@ -93,11 +93,11 @@ def compare(
     """Compare the runs of one setting.
 
     Args:
-        runs: one of each method at each seed.
+        runs: one run of each method at each seed.
         reference: the method that the others are compared with.
-        draws: of the bootstrap over test images.
-        seed: of the bootstrap.
-        clock: which seconds.
+        draws: number of bootstrap draws over test images.
+        seed: seed of the bootstrap.
+        clock: how seconds are measured.
 
     Raises:
         ValueError: the reference has no run, or no seed is common to all methods.
@@ -137,7 +137,7 @@ Curve = tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"]]
 
 
 def biased_ap(run: FinishedRun, clock: Clock) -> Curve:
-    """Return the biased objects' mean score over the seconds of a clock."""
+    """Return the curve of the biased objects' mean score over time."""
     curve, biased = run.results["curve"], run.results["biased"]
     ap = [_mean(point["ap"]["per_class"][name] for name in biased) for point in curve]
     return np.asarray([point[clock] for point in curve]), np.asarray(ap)
@@ -146,7 +146,7 @@ def biased_ap(run: FinishedRun, clock: Clock) -> Curve:
 def area_under(
     seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], first: float, last: float
 ) -> float:
-    """Return the mean of AP over log seconds in [first, last], AP as ``ap_at`` has it at every budget."""
+    """Return the mean of AP over log seconds in [first, last], with AP at every budget given by ``ap_at``."""
     begun = seconds > 0.0
     if not begun.any():
         return float(ap[0])
@@ -158,7 +158,7 @@ def area_under(
 
 
 def ap_at(seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], budget: float) -> float:
-    """Return AP at a budget: linear in log seconds between scored points, the start's until the first of them."""
+    """Return AP at a budget: linear in log seconds between scored points, the initial AP before the first of them."""
     begun = seconds > 0.0
     if not begun.any() or budget < seconds[begun][0]:
         return float(ap[0])
@@ -175,7 +175,7 @@ class Curves:
 
     @property
     def cheapest(self) -> dict[int, float]:
-        """The least seconds that any method took in all, by seed; 0 where none took any."""
+        """The total seconds of the cheapest method, by seed; 0 if no method took any."""
         ends = {at: [self.of[method, at][0][-1] for method in self.methods] for at in self.seeds}
         return {at: min((end for end in own if end > 0.0), default=0.0) for at, own in ends.items()}
 
@@ -188,7 +188,7 @@ class Curves:
 
     @cached_property
     def budgets(self) -> list[float]:
-        """Seconds from the first scored iteration of any run to the last; empty where no run took any."""
+        """Seconds from the first scored iteration of any run to the last; empty if no run took any."""
         spent = np.concatenate([seconds[seconds > 0.0] for seconds, _ in self.of.values()])
         if not len(spent):
             return []
@@ -196,14 +196,14 @@ class Curves:
 
     @property
     def ahead_at(self) -> dict[str, list[Estimate]]:
-        """The first method's lead over each other one at each of ``budgets``; empty without any."""
+        """The first method's lead over each other one at each of ``budgets``; empty without budgets."""
         reached = [{key: ap_at(*curve, budget) for key, curve in self.of.items()} for budget in self.budgets]
         others = self.methods[1:] if reached else ()
         return {method: [self._ahead(values, method) for values in reached] for method in others}
 
     @property
     def area_ahead(self) -> dict[str, Estimate]:
-        """The same of areas under the curves, from the first scored iteration of any run to the last end."""
+        """The first method's lead in the area under the curve, from the first scored iteration to the last end."""
         spent = [times[times > 0.0] for times, _ in self.of.values() if (times > 0.0).any()]
         first, last = (
             min((times.min() for times in spent), default=0.0),

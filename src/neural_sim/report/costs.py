@@ -1,4 +1,4 @@
-"""What methods cost: seconds by phase, images, memory, and how exact the gradients were that they followed."""
+"""The costs of methods: seconds by phase, images, memory, and the relative error of their gradients."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ PHASES: Mapping[str, tuple[str, ...]] = {
     "derivative": ("hypergradient",),
     "scores": ("judge", "reward", "certify"),
 }
-"""Phases of an iteration of the psi loop, as its records have them, by the columns of a table."""
+"""The phases in records of the psi loop that make up each column of the table."""
 SECONDS = ("warm start", *PHASES, "in all")
 HEAD = (*(f"{column}, s" for column in SECONDS), "MB", "images", "error of the gradient")
-"""Of the columns of ``cells``."""
+"""Headings of the columns of ``cells``."""
 NOTE = (
     "Seconds on the wall, of the warm start and of the psi loop by phase. MB: the most that the process of a run had "
     "in memory. Images: those rendered for both. Error of the gradient: its standard error over images relative to "
@@ -31,13 +31,14 @@ NOTE = (
 
 @dataclass(frozen=True)
 class Costs:
-    """What one method costs.
+    """The costs of one method.
 
     Args:
-        seconds: by column of ``SECONDS``, means over runs.
-        images: rendered, the mean over runs.
-        memory: the largest of any run in MB; None: not recorded.
-        error: the median standard error of a gradient relative to its length; None: no gradient, or not known.
+        seconds: seconds by column of ``SECONDS``, means over runs.
+        images: number of rendered images, mean over runs.
+        memory: peak memory of any run in MB; None: not recorded.
+        error: median standard error of a gradient relative to its length; None: there is no gradient, or its error is
+            not known.
     """
 
     seconds: Mapping[str, float]
@@ -47,7 +48,7 @@ class Costs:
 
 
 def costs(runs: Sequence[FinishedRun]) -> dict[str, Costs]:
-    """Return what every method costs, in the order of the runs."""
+    """Return the costs of every method, in the order of the runs."""
     by_method: dict[str, list[Mapping[str, Any]]] = {}
     for run in runs:
         by_method.setdefault(run.method, []).append(run.results)
@@ -67,20 +68,20 @@ def _costs(runs: Sequence[Mapping[str, Any]]) -> Costs:
 
 
 def _seconds(run: Mapping[str, Any]) -> dict[str, float]:
-    """Seconds by column of ``SECONDS``; phases ``hypergradient_*`` are parts of ``hypergradient``."""
+    """Return seconds by column of ``SECONDS``; phases ``hypergradient_*`` are parts of ``hypergradient``."""
     loop = {
         column: sum(record["seconds"].get(phase, 0.0) for record in run["iterations"] for phase in phases)
         for column, phases in PHASES.items()
     }
     total = run["curve"][-1]["seconds"]
-    # What the store had is charged with the seconds that it took, so not the stage's own in this run.
+    # A result from the store is charged with the seconds that it took to make, not with those of this run's stage.
     return {"warm start": max(total - sum(loop.values()), 0.0), **loop, "in all": total}
 
 
 def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
-    """Relative errors of every object's gradient in every iteration.
+    """Return the relative error of every object's gradient in every iteration.
 
-    A gradient that is zero or whose error is not known has none, nor have those of older runs, which did not record it.
+    Gradients that are zero or whose error is unknown are left out, as are those of older runs, which did not record it.
     """
     pairs = [
         pair
@@ -94,7 +95,7 @@ def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
 
 
 def costs_table(runs: Sequence[FinishedRun]) -> str:
-    """Return a Markdown table with a row a method."""
+    """Return a Markdown table with one row per method."""
     table = markdown_table(["cost", *HEAD], [[method, *cells(cost)] for method, cost in costs(runs).items()])
     commits = sorted({run.results.get("commit") or UNKNOWN for run in runs})
     return f"{table}\n\nOf {len(runs)} run{'s' * (len(runs) > 1)}, commit {', '.join(commits)}. {NOTE}"

@@ -1,4 +1,4 @@
-"""The SQLite file of a tracking store: what it must be, and who may write to it."""
+"""The SQLite file of a tracking store: checks, a lock for writers, and upgrades of its schema."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def database_of(uri: str) -> Path | None:
 
 
 def guard(uri: str) -> AbstractContextManager[Any]:
-    """Let one writer at a time use a SQLite file, among this program's processes."""
+    """Lock a SQLite file, so that only one of this program's processes writes to it at a time."""
     from filelock import FileLock
 
     database = database_of(uri)
@@ -30,10 +30,10 @@ def guard(uri: str) -> AbstractContextManager[Any]:
 
 
 def check_database(database: Path) -> None:
-    """Refuse at once what MLflow would try to open for minutes: a folder, another kind of file, a damaged one.
+    """Refuse what MLflow would try to open for minutes: a folder, a file that is no database, a damaged database.
 
     Raises:
-        ValueError: with the file and what to do.
+        ValueError: the file cannot be used; the message says what to do.
     """
     todo = "move it away, or set paths.mlflow"
     try:
@@ -46,7 +46,7 @@ def check_database(database: Path) -> None:
             if file.read(len(_SQLITE)) != _SQLITE:
                 raise ValueError(f"paths.mlflow: {database} is no SQLite database; {todo}")
         with closing(
-            # Not read-only: what a killed process left half written is undone now, by the journal beside the file.
+            # Not read-only, so that SQLite rolls back what a killed process left half written in the journal.
             sqlite3.connect(database.as_uri() + "?mode=rw", uri=True, timeout=_PATIENCE)
         ) as connection:
             connection.execute("select count(*) from sqlite_master").fetchone()
@@ -54,17 +54,17 @@ def check_database(database: Path) -> None:
         raise ValueError(
             f"paths.mlflow: {database} cannot be used ({error.strerror or error}); {todo}"
         ) from error
-    except sqlite3.OperationalError as error:  # as where another program has it locked, or the disk fails
+    except sqlite3.OperationalError as error:  # for instance, another program holds a lock, or the disk fails
         raise ValueError(f"paths.mlflow: {database} cannot be used ({error}); {todo}") from error
     except sqlite3.DatabaseError as error:
         raise ValueError(f"paths.mlflow: {database} is damaged ({error}); {todo}") from error
 
 
 def upgrade(database: Path) -> None:
-    """Bring a database of an older MLflow to this one's schema, after a copy of it and a line in the log.
+    """Upgrade a database of an older MLflow to the installed version's schema; it is copied first, and logged.
 
-    MLflow itself either does so without a copy or refuses the database. One that this version does not know stays as
-    it is.
+    MLflow itself either upgrades without a copy or refuses the database. A schema that the installed version does not
+    know stays as it is.
     """
     before = _schema_of(database)
     if before is None:
@@ -90,7 +90,7 @@ def upgrade(database: Path) -> None:
 
 
 def _schema_of(database: Path) -> str | None:
-    """Return the version of a database's tables; None where it has none yet."""
+    """Return the schema version of a database; None if it has no tables yet."""
     if not database.exists() or not database.stat().st_size:
         return None
     with closing(sqlite3.connect(database, timeout=_PATIENCE)) as connection:
@@ -102,7 +102,7 @@ def _schema_of(database: Path) -> str | None:
 
 
 def _copy(database: Path, copy: Path) -> None:
-    """Copy a database, whole although others may write to it."""
+    """Copy a database consistently, even while others write to it."""
     draft = copy.with_name(f".{copy.name}.part")
     draft.unlink(missing_ok=True)
     with (

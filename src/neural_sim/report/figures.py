@@ -1,4 +1,4 @@
-"""The figures that a run leaves, and what all figures have in common."""
+"""The figures of a run, and the style that all figures share."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from neural_sim.types import LabelledImages
 matplotlib.use("Agg")
 
 INK, MUTED, GRID = "#22262b", "#6b727b", "#e4e7ea"
-# Okabe and Ito's palette (Color Universal Design, 2008), which readers with any colour vision tell apart.
 Thumbnails = Mapping[str, Mapping[str, UInt8[Tensor, "bins h w 3"]]]
 """Pictures of an object from the middle of every bin, by object and factor."""
+# Okabe and Ito's palette (Color Universal Design, 2008), which readers with any colour vision can tell apart.
 METHOD_COLOURS = {
     "ns": "#b0b7bf", "learned": "#0072b2", "matched": "#009e73", "synthetic_only": "#56b4e9", "real_only": "#e69f00",
     "views_only": "#cc79a7",
@@ -35,7 +35,7 @@ CLASS_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00
 
 
 def style(axes: Any) -> None:
-    """Give axes the frame that all figures have."""
+    """Give axes the frame that all figures share."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -51,7 +51,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def psi_figure(learned: Sequence[Learned], title: str) -> Figure:
-    """Draw P over a factor's bins at every iteration, stacked, with the target's next to it, a panel an object."""
+    """Draw one panel per object: P over a factor's bins, stacked by iteration, next to the target's."""
     columns = min(3, len(learned))
     rows = -(-len(learned) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.5 * rows + 0.9), layout="constrained")
@@ -71,7 +71,7 @@ def psi_figure(learned: Sequence[Learned], title: str) -> Figure:
 
 
 def bin_colours(factor: str, bins: int) -> Any:
-    """Return a colour a bin; only a pose's close the circle."""
+    """Return one colour per bin; those of poses are cyclic, as the angle is."""
     return matplotlib.colormaps["twilight_shifted" if factor == "pose" else "viridis"](
         np.linspace(0.08, 0.92, bins)
     )
@@ -106,7 +106,7 @@ def psi_panel(axes: Any, learned: Learned) -> None:
 
 
 def shown_panel(axes: Any, one: FactorEstimate) -> None:
-    """Draw what the target shows with its intervals, and where psi stands, by bin; bins that look the same as one."""
+    """Draw the estimate from the target's boxes with its intervals, and psi, by bin; bins that look the same as one."""
     groups = one.groups
     start, p, low, high = (
         merged(torch.tensor(values), groups).numpy() for values in (one.start, one.p, one.low, one.high)
@@ -125,7 +125,7 @@ def shown_panel(axes: Any, one: FactorEstimate) -> None:
 
 
 def _titled(learned: Learned) -> str:
-    """Write the object's name, and which of its bins are one."""
+    """Write the object's name, and which of its bins are treated as one."""
     same = ["=".join(map(str, group)) for group in learned.groups if len(group) > 1]
     return f"{learned.name} ({', '.join(same)})" if same else learned.name
 
@@ -133,7 +133,7 @@ def _titled(learned: Learned) -> str:
 def ap_figure(
     ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised: Sequence[str], score: Score = "AP"
 ) -> Figure:
-    """Draw AP (or accuracy) of every class for each training distribution; biased classes stand first, in bold."""
+    """Draw AP (or accuracy) of every class for each training distribution; biased classes come first, in bold."""
     order = [n for n in class_names if n in emphasised] + [n for n in class_names if n not in emphasised]
     labels = [*order, "mean"]
     figure = Figure(figsize=(1.1 * len(labels) + 1.6, 3.2), layout="constrained")
@@ -165,10 +165,10 @@ def image_grid(
     predictions: Sequence[Mapping[str, torch.Tensor]] | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw images with their boxes (solid), or with the best prediction solid over dashed true boxes.
+    """Draw images with their boxes (solid), or with the best prediction (solid) over the ground truth (dashed).
 
-    A caption names one object, and how many more there are. All images go on one canvas: an axes each would take a
-    hundred times as long to lay out.
+    A caption names one object, and how many more there are. All images share one canvas: one axes per image would take
+    a hundred times as long to lay out.
     """
     count, height, width = len(images), *images.images.shape[-2:]
     columns = max(1, min(columns, count))
@@ -200,20 +200,20 @@ def image_grid(
 
 
 STRIP = {"the target": 2, "rendered at first": 3, "rendered now": 3}
-"""Images of each object in each part of the strip."""
+"""Number of images of each object in each part of the strip."""
 
 
 def strip_figure(
     results: RunResults, target: LabelledImages, before: LabelledImages, after: LabelledImages, rows: int = 2
 ) -> Figure:
-    """Draw what a run did in one look: target images, training images before and after, and AP, for a few objects.
+    """Draw a run at a glance: target images, training images before and after, and AP, for a few objects.
 
     Args:
-        results: of the run.
+        results: the run's results.
         target: the test images.
         before: training images from the initial distribution, an equal number of every object in the order of labels.
-        after: the same from the learned one.
-        rows: most objects; those that start from another distribution than the target's come first.
+        after: the same from the learned distribution.
+        rows: largest number of objects; those whose initial distribution is not the target's come first.
     """
     height, width = target.images.shape[-2:]
     head, gap, inch = round(0.2 * height), round(0.25 * width), width  # an image is an inch wide
@@ -242,7 +242,7 @@ def strip_figure(
 
 
 def _gained(results: RunResults, name: str) -> str:
-    """Write what an object's score was, is, and would be."""
+    """Write an object's score before, after, and with the target's distribution."""
     values = {
         CALLED[which]: 100 * results.ap[which]["per_class"].get(name, float("nan"))
         for which in ("ns", "learned", "matched")
@@ -255,10 +255,10 @@ def bins_figure(results: RunResults, bins: Thumbnails, factor: str, rows: int = 
     """Draw the bins of a factor as pictures of a few objects, with their shares of images before and after.
 
     Args:
-        results: of the run.
+        results: the run's results.
         bins: the pictures.
-        factor: whose bins.
-        rows: most objects, see ``strip_figure``.
+        factor: the factor.
+        rows: largest number of objects, see ``strip_figure``.
     """
     chosen = [one for name in _first(results, rows) for one in results.of_factor(factor) if one.name == name]
     columns = len(chosen[0].p["learned"])
@@ -278,7 +278,7 @@ def bins_figure(results: RunResults, bins: Thumbnails, factor: str, rows: int = 
 
 
 def _first(results: RunResults, count: int) -> list[str]:
-    """Return a few objects; those that start from another distribution than the target's come first."""
+    """Return the first ``count`` objects; those whose initial distribution is not the target's come first."""
     return [*results.biased, *(name for name in results.names if name not in results.biased)][:count]
 
 
@@ -316,13 +316,13 @@ def write_figures(
     """Write a run's figures as PNG files.
 
     Args:
-        results: of the run.
+        results: the run's results.
         drawn: training images of the learned distribution.
         test: the test images.
-        detections: on these, of the detector trained on the learned distribution; empty without.
+        detections: detections on the test images by the detector trained on the learned distribution; may be empty.
         folder: where the files go.
-        before_and_after: a few training images of every object, see ``strip_figure``; None: without that figure.
-        bins: pictures of every bin; None: without that figure.
+        before_and_after: a few training images of every object, see ``strip_figure``; None omits that figure.
+        bins: pictures of every bin; None omits that figure.
     """
     made: dict[str, Figure] = {}
     if before_and_after is not None and results.ap:

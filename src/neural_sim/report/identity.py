@@ -1,4 +1,4 @@
-"""Which runs are comparable, by digests of what is scored, of all settings of a run, and of its test set."""
+"""Decide which runs are comparable, by digests of their scoring, of all their settings, and of their test sets."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ KEYS = ("scoring", "configuration", "test_set")
 SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "detector", "training")
 """Groups of the configuration that a detector's AP depends on, whichever method chose its training distribution."""
 METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint")
-"""Keys of ``parameter.*`` and ``synthesis`` that say how a method draws, steps and differentiates; the rest says where
-it starts and what it aims at."""
+"""Keys of ``parameter.*`` and ``synthesis`` that say how a method draws, steps and differentiates; the others define
+the initial distribution and the target's."""
 RUN_KEYS = ("seed", "score_at", "stages", "progress", "resume", "workers", "worker_gpus", "paths", "trainer")
 """Keys by which runs of the same settings may differ."""
 SHOWN = 3
-"""Differences that are named; the rest is counted."""
+"""Number of differences that are named; the others are counted."""
 
 
 def identity(
     config: Mapping[str, Any], files: Mapping[str, Any], code: Mapping[str, str], test: LabelledImages
 ) -> dict[str, Any]:
-    """Return what results.json carries for a comparison.
+    """Return the part of results.json that identifies a run for comparisons.
 
     Args:
         config: the resolved configuration.
-        files: digests of what the run reads: ``objects`` by name in their order, and files of other groups.
-        code: versions of the code, ``scoring`` of what trains and scores a detector, ``method`` of what moves psi.
+        files: digests of the files that the run reads: ``objects`` by name in their order, and files of other groups.
+        code: versions of the code: ``scoring`` trains and scores a detector, ``method`` moves psi.
         test: the test set.
 
     Returns:
-        ``scoring``: digest of all that must be equal for the AP of two methods to be comparable; ``configuration``:
-        digest of all settings but ``RUN_KEYS``, so that a method's seeds share it; ``test_set``: digest of the test
-        images and labels; ``config``, ``files`` and ``code``, to say what differs; and the ``commit`` of the code, None
-        outside a checkout.
+        ``scoring``: digest of everything that must be equal for the AP of two methods to be comparable;
+        ``configuration``: digest of all settings but ``RUN_KEYS``, which a method's seeds share; ``test_set``: digest
+        of the test images and labels; ``config``, ``files`` and ``code``, to report differences; and the ``commit`` of
+        the code, None outside a checkout.
     """
     scored = {"config": scored_config(config), "files": files, "names": list(files["objects"])}
     settings = {key: value for key, value in config.items() if key not in RUN_KEYS}
@@ -54,18 +54,18 @@ def identity(
 
 
 def at_scale(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether all budget keys of the run match today's; keys added later are ignored.
+    """Check that all budget keys of a run match the present ones; keys added later are ignored.
 
     Args:
-        then: the run's budget; values are compared as text, as MLflow has them.
-        now: today's.
+        then: the run's budget; values are compared as text, as MLflow stores them.
+        now: the present budget.
     """
     had, have = ({key: str(value) for key, value in flatten(budget).items()} for budget in (then, now))
     return bool(had) and had.items() <= have.items()
 
 
 def scored_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what scores depend on, whichever method is scored; objects go by their contents."""
+    """Return the settings that scores depend on, whatever the method; objects are identified by their contents."""
     parameters = {name: _without_choices(node) for name, node in config["parameter"].items()}
     return {**{group: _without_choices(config[group]) for group in SCORED}, "parameter": parameters}
 
@@ -75,21 +75,21 @@ def _without_choices(node: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def scored_values(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all that goes into the digest ``scoring``, flat, by the names that a reader of a comparison sees."""
+    """Return everything in the digest ``scoring``, flattened, with the names that comparisons show."""
     config = {**scored_config(results["config"]), "objects": results["config"]["objects"]}
     files = {f"contents of {key}": _short(value) for key, value in flatten(results["files"]).items()}
     return {**flatten(config), **files, "code that trains and scores": results["code"]["scoring"][:8]}
 
 
 def all_values(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all that goes into the digests ``configuration`` and ``scoring``, flat."""
+    """Return everything in the digests ``configuration`` and ``scoring``, flattened."""
     config = {key: value for key, value in results["config"].items() if key not in RUN_KEYS}
     method = {"code of the method": results["code"]["method"][:8]}
     return {**flatten(config), **scored_values(results), **method}
 
 
 def differing(all_of: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return names whose values differ between mappings; ``_target_``, the class that a group names, comes first."""
+    """Return the names whose values differ between mappings; a group's class, ``_target_``, comes first."""
     names = list(dict.fromkeys(name for values in all_of for name in values))
     different = [n for n in names if any(v.get(n, _ABSENT) != all_of[0].get(n, _ABSENT) for v in all_of)]
     return sorted(different, key=lambda name: not name.endswith("_target_"))

@@ -1,11 +1,11 @@
 """Means over seeds, or over trainings, with 95 % intervals.
 
-A score differs between seeds (objects' fields, training and test images, initial parameters) and between test images.
-A few seeds tell little of their own scatter, so that an interval has Student's quantile for it. Resampling the seeds
-instead covers the truth in 81, 86 and 92 of 100 cases with 2, 3 and 5 of them. Where all seeds share the test images,
-as trainings repeated on one target do, the images' part of a mean does not shrink with the number of seeds. It is
-therefore added, as squares. Where each seed has test images of its own, the scatter between seeds has that part
-already, and intervals are a little wide: they cover 98 of 100.
+A score varies between seeds (objects' fields, training and test images, initial parameters) and between test images.
+A few seeds say little about their own scatter, so intervals use Student's quantile; resampling the seeds instead would
+cover the truth in only 81, 86 and 92 of 100 cases with 2, 3 and 5 seeds. If all seeds share the test images, as
+trainings repeated on one target do, the test images' part of the variance does not shrink with the number of seeds. It
+is therefore added, as squares. If each seed has test images of its own, the scatter between seeds already includes that
+part, and intervals are slightly too wide: they cover 98 of 100.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from scipy.special import ndtri, stdtrit  # imported in a fifth of scipy.stats' 
 NORMAL = float(ndtri(0.975))
 
 Sample = tuple[Float[np.ndarray, "seeds"], Float[np.ndarray, "draws seeds"]]
-"""The values of all seeds, and those under resampled test images, nan where these show no box."""
+"""The values of all seeds, and those under resampled test images; nan if these show no box."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its 95 % interval, None where there is nothing to tell it from."""
+    """A number with its 95 % interval, None if it cannot be estimated."""
 
     value: float
     low: float | None = None
@@ -33,7 +33,7 @@ class Estimate:
 
     @property
     def certain(self) -> bool:
-        """Whether there is an interval that leaves 0 out."""
+        """Whether there is an interval and it excludes 0."""
         return self.low is not None and self.high is not None and (self.low > 0.0 or self.high < 0.0)
 
     @property
@@ -44,7 +44,7 @@ class Estimate:
 
     @property
     def as_fraction(self) -> Estimate:
-        """The same with the part of the interval that lies in [0, 1], where the number must lie."""
+        """The estimate with its interval clipped to [0, 1], where the number must lie."""
         if self.low is None or self.high is None:
             return self
         return Estimate(self.value, max(self.low, 0.0), min(self.high, 1.0))
@@ -56,7 +56,7 @@ def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:
     Args:
         estimate: the fraction.
         unit: follows the value, which then has no decimals.
-        sure: set the value in bold where the interval excludes 0.
+        sure: set the value in bold if the interval excludes 0.
     """
     digits = 0 if unit else 1
     text = _hundredfold(estimate.value, digits) + (f" {unit}" if unit else "")
@@ -74,12 +74,12 @@ def bounds(estimate: Estimate) -> str:
 
 
 def _hundredfold(value: float, digits: int) -> str:
-    """In hundredths, never as a negative zero."""
+    """Write a value in hundredths, never as a negative zero."""
     return f"{100 * value:z.{digits}f}"
 
 
 def over_seeds(values: Float[np.ndarray, "seeds"]) -> Estimate:
-    """Return the mean with Student's interval; that of one seed has none."""
+    """Return the mean with Student's interval; a single seed has no interval."""
     value, n = float(np.mean(values)), len(values)
     if n == 1:
         return Estimate(value)
@@ -90,9 +90,9 @@ def over_seeds(values: Float[np.ndarray, "seeds"]) -> Estimate:
 def over_seeds_and_images(
     values: Float[np.ndarray, "seeds"], resampled: Float[np.ndarray, "draws seeds"]
 ) -> Estimate:
-    """Return the mean over seeds of a ``Sample``, given by its two parts.
+    """Return the mean over seeds of a ``Sample``, given by its two parts, with its interval.
 
-    One seed's interval is from the 2.5 % to the 97.5 % quantile over images.
+    For one seed, the interval goes from the 2.5 % to the 97.5 % quantile over images.
     """
     if len(values) == 1:
         return over_images(float(values[0]), resampled[:, 0])
@@ -102,16 +102,17 @@ def over_seeds_and_images(
 
 
 def over_images(value: float, resampled: Float[np.ndarray, "draws"]) -> Estimate:
-    """Return a value with the 2.5 % and 97.5 % quantiles of its resampled ones, nan left out."""
+    """Return a value with the 2.5 % and 97.5 % quantiles of its resampled values, without nan."""
     low, high = np.nanquantile(resampled, [0.025, 0.975])
     return Estimate(value, float(low), float(high))
 
 
 def ratio(numerator: Sample, denominator: Sample) -> Estimate:
-    """Return the mean numerator by the mean denominator, both over seeds and resampled test images.
+    """Divide the mean numerator by the mean denominator, both over seeds and resampled test images.
 
-    The interval is Fieller's: all ratios r for which the mean of numerator - r denominator is not told from 0. It is
-    unbounded, and None here, where the denominator is not told from 0.
+    The interval is Fieller's: all ratios r for which the mean of numerator - r denominator does not differ
+    significantly from 0. If the denominator does not differ significantly from 0, the interval is unbounded and
+    returned as None.
 
     Source: Fieller, Some problems in interval estimation (J. R. Stat. Soc. B 16, 1954).
     """
@@ -122,18 +123,21 @@ def ratio(numerator: Sample, denominator: Sample) -> Estimate:
     square = d * d - dd
     if square <= 0.0:
         return Estimate(value)
-    # (n - r d)^2 <= nn - 2 r nd + r^2 dd, with two roots wherever the square's factor is positive.
+    # (n - r d)^2 <= nn - 2 r nd + r^2 dd, with two roots if the factor of r^2 is positive.
     root = math.sqrt(max((n * d - nd) ** 2 - square * (n * n - nn), 0.0))
     return Estimate(value, (n * d - nd - root) / square, (n * d - nd + root) / square)
 
 
 def _quantile(seeds: int) -> float:
-    """Half-width of a mean's 95 % interval per standard deviation between seeds (Student's t); 0 for one seed."""
+    """Return the half-width of a mean's 95 % interval in standard deviations between seeds; 0 for one seed."""
     return float(stdtrit(seeds - 1, 0.975)) / math.sqrt(seeds) if seeds > 1 else 0.0
 
 
 def _covariance(a: Sample, b: Sample) -> float:
-    """Covariance of two means, its parts times their squared quantiles: for a = b, half an interval squared."""
+    """Return the covariance of two means, its parts times their squared quantiles.
+
+    For a = b, this is the squared half-width of the interval.
+    """
     seeds = len(a[0])
     of_seeds = float(np.cov(a[0], b[0])[0, 1]) if seeds > 1 else 0.0
     pair = np.stack([resampled.mean(1) for _, resampled in (a, b)])

@@ -42,13 +42,13 @@ REQUIRED = (
 @validated
 @dataclass(frozen=True)
 class ModelFiles:
-    """What the report writes of the final detector besides ``model.safetensors`` and ``model.json``.
+    """The files that the report writes for the final detector, in addition to its weights and ``model.json``.
 
     Args:
-        onnx: ``model.onnx``; wants the packages of the extra ``onnx``.
-        nms: non-maximum suppression inside ``model.onnx``, see ``onnx_export.export``.
-        pyfunc: a pyfunc model in the run in MLflow.
-        registered_name: under which MLflow registers a version of that; None: it does not.
+        onnx: write ``model.onnx``; needs the packages of the extra ``onnx``.
+        nms: include non-maximum suppression in ``model.onnx``, see ``onnx_export.export``.
+        pyfunc: log a pyfunc model to the run in MLflow.
+        registered_name: name under which MLflow registers a version of the pyfunc model; None: not registered.
 
     Raises:
         ValueError: ``onnx`` without its packages; ``nms`` without ``onnx``, or a name without ``pyfunc``.
@@ -74,9 +74,8 @@ class ModelFiles:
         path = saved.save(folder)
         if self.onnx:
             made = export(saved, folder / ONNX, self.nms)
-            if (
-                not self.nms
-            ):  # whose detections are not comparable one by one: nearly equal scores change places
+            # After suppression, detections cannot be compared one by one: nearly equal scores may change places.
+            if not self.nms:
                 shown = images[:CHECKED]
                 difference = largest_difference(saved, made, shown)
                 level = logging.INFO if difference <= TOLERANCE else logging.WARNING
@@ -90,17 +89,17 @@ def log_detector(
 ) -> str:
     """Write a detector to an open run as a pyfunc model.
 
-    The model takes RGB photographs of any one size and gives a table of detections, see
+    The model maps RGB photographs, all of one size, to a table of detections, see
     ``pyfunc_model.PhotographDetector``.
 
     Args:
-        run: open in MLflow.
-        folder: holds ``model.safetensors`` and ``model.json``.
+        run: the open run in MLflow.
+        folder: folder with ``model.safetensors`` and ``model.json``.
         example: photographs to show how the model is called.
-        registered_name: under which a version of the model is registered; None: it is not.
+        registered_name: name under which a version of the model is registered; None: not registered.
 
     Returns:
-        Its URI, ``models:/...``, for ``mlflow.pyfunc.load_model``.
+        The model's URI, ``models:/...``, for ``mlflow.pyfunc.load_model``.
     """
     with run.fluent() as mlflow:
         from mlflow.models import Model, ModelSignature

@@ -26,8 +26,8 @@ def draw(
     Args:
         photo: the photograph.
         found: its detections.
-        class_names: by label.
-        above: the least score that is drawn.
+        class_names: names of the classes, by label.
+        above: smallest score that is drawn.
         truth: true boxes, (x0, y0, x1, y1) in pixels, drawn thin and white.
     """
     drawn = photo.copy()
@@ -41,7 +41,7 @@ def draw(
         pen.rectangle(box, outline=colour, width=thick)
         caption = f" {class_names[label]} {score:.2f} "
         _, _, wide, high = pen.textbbox((0, 0), caption, font=font)
-        # Above the box, inside it where there is no room, and never past the picture's right edge.
+        # Captions go above the box, or inside it if there is no room, and never past the picture's right edge.
         left = max(0, min(box[0], photo.width - wide))
         top = box[1] - high - 2 if box[1] >= high + 2 else box[1]
         pen.rectangle((left, top, left + wide, top + high + 2), fill=colour)
@@ -50,7 +50,7 @@ def draw(
 
 
 def save_picture(picture: Image.Image, folder: Path, name: str) -> Path:
-    """Write a picture under its photograph's name, as PNG where PIL writes no files of that kind well."""
+    """Write a picture under its photograph's name, as PNG if PIL does not write the photograph's format well."""
     path = folder / name
     if path.suffix.lower() not in WRITABLE:
         path = path.with_name(f"{path.name}.png")
@@ -63,7 +63,7 @@ def save_picture(picture: Image.Image, folder: Path, name: str) -> Path:
 
 
 def scores_table(scores: TestScore, images: int) -> str:
-    """Return the score by class in percent, as it is printed."""
+    """Return the printed table of scores by class, in percent."""
     if isinstance(scores, AveragePrecision):
         name, columns = "AP", {"AP": scores.per_class, "AP50": scores.per_class_ap50}
         means = [scores.ap, scores.ap50]

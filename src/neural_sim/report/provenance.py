@@ -1,4 +1,4 @@
-"""What results depend on besides their settings: the command, the commit of the code, and the machine."""
+"""The provenance of results, in addition to their settings: the command, the commit of the code, the machine."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ SMALLEST = "smoke"
 
 @cache
 def commit(package: Path = PACKAGE) -> str | None:
-    """Return seven digits of the checkout's commit, with ``-dirty`` where tracked files differ from it.
+    """Return seven digits of the checkout's commit, with ``-dirty`` if tracked files differ from it.
 
-    None where ``package`` is not tracked by git, as when it is installed into a folder of another project, and where
-    git does not answer.
+    None if ``package`` is not tracked by git (for instance, installed in a folder of another project), or if git fails.
     """
     if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
         return None
@@ -40,7 +39,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def machine(device: torch.device | None = None) -> dict[str, Any]:
-    """Return what a timing depends on: processor, threads, load, versions, and the GPU's name and memory if any."""
+    """Describe the machine, for timings: processor, threads, load, versions, and the GPU's name and memory if any."""
     return gpu(device) | {
         "processor": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
@@ -52,7 +51,7 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
 
 
 def gpu(device: torch.device | None) -> dict[str, Any]:
-    """Return a GPU's name and memory, and the most that tensors held since its peak was reset; nothing for a CPU."""
+    """Return a GPU's name, its memory, and the peak memory of tensors since the last reset; only the type of a CPU."""
     if device is None or device.type != "cuda":
         return {} if device is None else {"device": device.type}
     held = torch.cuda.get_device_properties(device)
@@ -65,14 +64,14 @@ def gpu(device: torch.device | None) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Made:
-    """How a run was made, for whoever reads its page.
+    """How a run was made, for readers of its page.
 
     Args:
-        command: that makes it again.
+        command: the command that repeats it.
         scale: the choice of ``scale``; empty: not known.
         date: day and time of the report.
-        machine: see ``machine``.
-        shows: what its test images are, such as ``synthetic test images``.
+        machine: description of the machine, see the function ``machine``.
+        shows: kind of test images, such as ``synthetic test images``.
     """
 
     command: str = ""
@@ -83,7 +82,7 @@ class Made:
 
     @property
     def caution(self) -> str:
-        """What a reader must know before any score; empty if nothing."""
+        """A warning to show before any score; empty if there is none."""
         return caution(self.scale)
 
     @property
@@ -98,7 +97,7 @@ class Made:
 
 
 def caution(scale: str) -> str:
-    """Say of a scale that its scores mean nothing; empty for all that are meant to be read."""
+    """Return a warning if scores at this scale mean nothing; empty for other scales."""
     return (
         f"A trial (scale={scale}): it shows that everything runs, and its scores mean nothing."
         if scale == SMALLEST

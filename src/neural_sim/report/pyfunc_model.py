@@ -19,16 +19,16 @@ COLUMNS = ("image", "label", "score", "x0", "y0", "x1", "y1")
 
 
 class PhotographDetector(PythonModel):
-    """Turns RGB photographs of one size, uint8 [n, h, w, 3], into a table with a row a detection.
+    """Maps RGB photographs of one size, uint8 [n, h, w, 3], to a table with one row per detection.
 
-    Rows are by image, the best first: the image's number from 0, the class's name, the score, the box in the
+    Rows are sorted by image and falling score: the image's number from 0, the class name, the score, the box in the
     photograph's pixels.
     """
 
     @override
     def load_context(self, context: Any) -> None:
         folder = Path(context.artifacts["weights"]).parent
-        # MLflow runs the code of a model, this file: whoever loads it trusts the detector's, too.
+        # MLflow runs a model's code (this file), so users who load it already trust it, and with it the detector's.
         named = read_json(folder / DOCUMENT)["detector"]["class"]
         self.saved = SavedDetector.load(folder, named.replace(":", "."))
 

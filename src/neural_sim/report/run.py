@@ -1,4 +1,4 @@
-"""What a run has found: results.json, and the summary that is printed."""
+"""The results of a run: results.json, and the printed summary."""
 
 from __future__ import annotations
 
@@ -27,21 +27,22 @@ CALLED = {
     "real_only": "photographs alone",
     "views_only": "the fields' views alone",
 }
-"""What readers see for the names that detectors have in files, by what they were trained on."""
+"""Names of detectors for readers, by their names in files, which say what they were trained on."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """The distribution of one factor of one object: what it was at first, became and should be.
+    """The distribution of one factor of one object: initial, learned, and the target's.
 
     Args:
-        name: of the object.
-        factor: of the parameters, for instance ``pose``.
-        groups: bins (from 1) that look the same; a bin each where nothing is known. They are scored and drawn as one.
-        p: probabilities of the bins: ``initial``, ``learned`` and, where it is known, ``target``.
-        history: those at the start of every iteration, and the learned ones; one row where nothing was learned.
-        distances: total variation of ``initial`` and ``learned`` from the target, over groups; empty where it is not
-            known.
+        name: the object.
+        factor: the factor of the parameters, for instance ``pose``.
+        groups: groups of bins (from 1) that look the same, which are scored and drawn as one; one bin in each if
+            nothing is known.
+        p: probabilities of the bins: ``initial``, ``learned`` and, if known, ``target``.
+        history: probabilities at the start of every iteration, and the learned ones; one row if nothing was learned.
+        distances: total variation of ``initial`` and ``learned`` from the target, over groups; empty if the target's
+            distribution is not known.
     """
 
     name: str
@@ -54,34 +55,34 @@ class Learned:
 
 @dataclass(frozen=True)
 class RunResults:
-    """Everything the report shows.
+    """Everything that the report shows.
 
     Args:
-        experiment: its name.
-        method: what chose the training images.
-        seed: of the run.
-        names: of the objects, in the order of their labels.
-        biased: objects that start from another distribution than the target's.
-        probabilities: ``initial``, ``learned`` and ``target`` by factor, [objects, k]. Photographs whose distribution
-            is not known have neither target nor ``matched`` in ``ap``.
+        experiment: name of the experiment.
+        method: the method that chose the training images.
+        seed: seed of the run.
+        names: names of the objects, in the order of their labels.
+        biased: objects whose initial distribution is not the target's.
+        probabilities: ``initial``, ``learned`` and ``target`` by factor, [objects, k]. For photographs whose
+            distribution is not known, there is neither a target nor ``matched`` in ``ap``.
         records: iterations of the psi loop.
-        ap: scores on the test set of ns, learned and matched, and where photographs train too, of synthetic_only,
+        ap: scores on the test set of ns, learned and matched and, if training also uses photographs, of synthetic_only,
             real_only and views_only.
         fields: scores of every object's field while it was fitted.
-        seconds: by stage.
-        memory: the largest so far in MB by name, see ``devices.peak_memory_mb``.
+        seconds: seconds by stage.
+        memory: peak memory so far in MB by name, see ``devices.peak_memory_mb``.
         left_out: work that was not done, and why.
         config: the whole configuration.
-        validation_ap: the score of the detector of ``learned`` on the validation images, the outer objective's:
-            settings are chosen by it, nothing is reported by it.
-        curve: what the method had spent (images, detector_steps, products, seconds) and what its psi was worth (``ap``)
-            at every iteration that was scored.
+        validation_ap: score of the detector ``learned`` on the validation images of the outer objective. It is for
+            choosing settings, and never reported as a result.
+        curve: cost so far (images, detector_steps, products, seconds) and score of the present psi (``ap``), at every
+            iteration that was scored.
         symmetric_bins: groups of bins (from 1), by object and angle, whose views an object's symmetry makes the same.
-        identity: which runs this one can be compared with, see ``identity.identity``.
-        real: how photographs trained (``mode``) and how many (``photographs``); empty without.
-        score: what detectors are scored by: AP, or accuracy, which ``ap`` then has.
-        shown: what the target's boxes show; empty where nobody read them.
-        made: how it was made.
+        identity: digests that say which runs are comparable, see ``identity.identity``.
+        real: how training used photographs (``mode``) and how many (``photographs``); empty without photographs.
+        score: the kind of score in ``ap``: AP, or accuracy.
+        shown: the estimate from the target's boxes; empty if none was made.
+        made: how the run was made.
     """
 
     experiment: str
@@ -113,7 +114,7 @@ class RunResults:
 
     @property
     def factors(self) -> tuple[str, ...]:
-        """Names of what is learned, in order."""
+        """Names of the learned factors, in order."""
         return tuple(self.probabilities["learned"])
 
     @cached_property
@@ -127,14 +128,14 @@ class RunResults:
                 groups = self.symmetric_bins.get(name, {}).get(factor) or bins
                 listed = {which: values.tolist() for which, values in p.items()}
                 steps = [record["probabilities"][factor][label] for record in self.records]
-                # The first record may already be that of a first step.
+                # The first record may already follow a proposed first step.
                 before = [listed["initial"], *steps[1:]] if self.moved else []
                 history = [*before, listed["learned"]]
                 found.append(Learned(name, factor, groups, listed, history, _distances(p, groups)))
         return tuple(found)
 
     def of_factor(self, factor: str) -> list[Learned]:
-        """Return a factor's distributions of all objects."""
+        """Return the distributions of a factor for all objects."""
         return [one for one in self.learned if one.factor == factor]
 
     @property
@@ -231,7 +232,7 @@ def _distances(p: Mapping[str, Tensor], groups: Sequence[Sequence[int]]) -> dict
 
 
 def _left_out_line(left_out: Sequence[Mapping[str, Any]]) -> str:
-    """Write fractions of the work that was left out, and the results that the store had."""
+    """Write fractions of the work that was left out, and the number of results read from the store."""
     stored = [o for o in left_out if o["why"] == "found in the store"]
     others = [o for o in left_out if o not in stored and o["fraction"] is not None]
     parts = [f"{o['what']} {o['fraction']:.0%}" for o in others]
@@ -242,7 +243,7 @@ def _left_out_line(left_out: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _trust_line(trust: Mapping[str, Any]) -> str:
-    """Write how many psi steps of objects and factors were not trusted, why, and what became of them."""
+    """Write how many psi steps of objects and factors were not trusted, why, and what happened to them."""
     text = f"untrusted psi steps of objects: {trust['untrusted']} of {trust['steps']}"
     for part in ("actions", "doubts"):
         if trust[part]:

@@ -1,4 +1,4 @@
-"""A run in MLflow: its iterations as series while they end, its final numbers, its folder as artifacts."""
+"""Log a run to MLflow: its iterations as series, as they end; its final numbers; its folder as artifacts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _COUNTED = ("validation_loss", "training_loss", "images", "detector_steps", "pro
 
 
 class LiveRun:
-    """A run in MLflow while its stages run. Iterations and fields are written once, even if given again."""
+    """A run in MLflow while its stages are running. Iterations and fields are written only once, even if repeated."""
 
     def __init__(self, run: tracking.Run, names: Sequence[str]) -> None:
         self._run, self._names = run, names
@@ -28,7 +28,7 @@ class LiveRun:
 
     @property
     def where(self) -> str:
-        """How to look at it, see ``tracking.where``."""
+        """How to open the run in MLflow, see ``tracking.where``."""
         return self._run.where
 
     def iteration(self, record: Mapping[str, Any]) -> None:
@@ -37,7 +37,7 @@ class LiveRun:
         self._iterations += 1
 
     def iterations(self, records: Sequence[Mapping[str, Any]]) -> None:
-        """Write those that were not written when they ended: the loop's result was in the store."""
+        """Write the iterations that were not written when they ended, because the loop's result was in the store."""
         for record in records[self._iterations :]:
             self.iteration(record)
 
@@ -50,7 +50,7 @@ class LiveRun:
             self._fields.add(name)
 
     def stage(self, name: str, seconds: float) -> None:
-        """Write what a stage that has just ended took."""
+        """Write the duration of a stage that has just ended."""
         self._run.log({f"seconds/{name}": seconds})
 
     def detector(
@@ -60,7 +60,7 @@ class LiveRun:
         return log_detector(self._run, folder, example, registered_name)
 
     def finish(self, results: RunResults, folder: Path) -> None:
-        """Write what is left: iterations and fields from the store, final numbers, and ``folder`` as artifacts."""
+        """Write the rest: iterations and fields from the store, final numbers, and ``folder`` as artifacts."""
         self.iterations(results.records)
         self.fields(results.fields)
         self._run.log(_final(results))
@@ -143,9 +143,9 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
 
 
 def _curve(results: RunResults) -> dict[str, dict[int, float]]:
-    """Return the score of all objects and of the biased ones by what was spent.
+    """Return the scores of all objects and of the biased ones, as functions of the cost.
 
-    That is the step, so that runs chart side by side.
+    The cost serves as MLflow's step, so that charts compare runs at equal cost.
     """
     series: dict[str, dict[int, float]] = {}
     for point in results.curve:

@@ -1,8 +1,8 @@
-"""Finished runs as rows of a table: read from MLflow, grouped by what can be compared, the others with the reason.
+"""Read finished runs from MLflow, and group those that are comparable; the others are left out with a reason.
 
-Scores are comparable between runs that share what is scored (``scoring``) and the test images of a seed (``test_set``).
-Seeds may be averaged where a method ran with the same settings for all of them (``configuration``). The three are
-digests in results.json, see ``identity``.
+Scores are comparable between runs with the same scoring (``scoring``) and, for each seed, the same test images
+(``test_set``). Seeds may be averaged if a method ran with the same settings for all of them (``configuration``). The
+three are digests in results.json, see ``identity``.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from neural_sim.report.identity import KEYS, all_values, differences, headings, 
 from neural_sim.report.score_table import ScoreTable
 
 BOUNDS = ("ns", "matched")
-"""Detectors that every run of a seed has and that do not depend on its method: trained on the initial distribution and
-on the target's, if that is known. They stand for the methods of ``FIXED``, whose own runs are not compared again."""
+"""Detectors that every run has, whatever its method: trained on the initial distribution and, if known, on the
+target's. They represent the methods in ``FIXED``, whose own runs are not compared again."""
 FIXED = ("ns", "oracle")
 WITHOUT = ("synthetic_only", "real_only", "views_only")
-"""Detectors that are scored where photographs train too: on synthetic images alone, on photographs alone, and on the
-views of the fields alone."""
+"""Detectors that are also scored if training uses photographs: trained on synthetic images alone, on photographs alone,
+and on the views of the fields alone."""
 RESULTS = "results.json"
 
 Key = TypeVar("Key", bound=Hashable)
@@ -34,15 +34,15 @@ Key = TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """A run: what its results.json says, and its detections when they are asked for.
+    """A finished run: the content of its results.json, and its detections, which are read on demand.
 
     Args:
-        results: the content of results.json, empty where the run is unusable.
-        name: in MLflow.
-        run_id: in MLflow.
-        experiment: in MLflow.
-        read: makes ``outcomes``.
-        unusable: why there is nothing to compare.
+        results: the content of results.json, empty if the run is unusable.
+        name: name of the run in MLflow.
+        run_id: id of the run in MLflow.
+        experiment: experiment of the run in MLflow.
+        read: reads ``outcomes``.
+        unusable: why the run cannot be compared; None: it can.
     """
 
     results: Mapping[str, Any] = field(default_factory=dict)
@@ -54,7 +54,7 @@ class FinishedRun:
 
     @cached_property
     def outcomes(self) -> Mapping[str, Sequence[Outcomes]]:
-        """What the scores of its biased objects are computed from, for each of its detectors (ns, learned, ...)."""
+        """The outcomes from which its biased objects are scored, for each of its detectors (ns, learned, ...)."""
         return self.read()
 
     @property
@@ -69,7 +69,7 @@ class FinishedRun:
 
     @property
     def score(self) -> Score:
-        """What its detectors are scored by; versions without classifiers did not record it."""
+        """The kind of score; versions without classifiers did not record it."""
         return self.results.get("score", "AP")
 
     @property
@@ -84,11 +84,11 @@ class FinishedRun:
         return f"{self.name} ({self.run_id[:8]})"
 
     def spent(self, key: str) -> float:
-        """Return what the method needed in all: images, detector_steps, products, seconds or cpu_seconds."""
+        """Return the method's total cost: images, detector_steps, products, seconds or cpu_seconds."""
         return float(self.results["curve"][-1][key])
 
     def detector(self, name: str) -> Sequence[Outcomes]:
-        """Return a detector's outcomes by its name in a table, where a method stands for what it has learned."""
+        """Return the outcomes of a detector by its name in a table; a method's name means its ``learned``."""
         return self.outcomes[name if name in (*BOUNDS, *WITHOUT) else "learned"]
 
 
@@ -114,11 +114,11 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Runs:
-    """Rows of a table in their order, and the runs that rules have left out of it.
+    """The rows of a table in order, and the runs that rules have left out of it.
 
     Args:
-        rows: the runs, those of an experiment the newest first.
-        left_out: in the order in which they were left out.
+        rows: the runs, newest first within each experiment.
+        left_out: the other runs, in the order in which they were left out.
     """
 
     rows: tuple[FinishedRun, ...] = ()
@@ -142,7 +142,7 @@ class Runs:
         return Runs(kept, self.left_out + left)
 
     def groupby(self, key: Callable[[FinishedRun], Key]) -> dict[Key, Runs]:
-        """Group the rows, in the order of the groups' first rows; what was left out before is in none of them."""
+        """Group the rows, in the order of the groups' first rows; groups do not include runs left out before."""
         groups: dict[Key, list[FinishedRun]] = {}
         for run in self.rows:
             groups.setdefault(key(run), []).append(run)
@@ -159,9 +159,9 @@ class Group:
 
     Args:
         setting: the experiment and its gap.
-        label: names the group among all of a comparison.
-        heading: how it differs from other groups of the same setting; empty for the only one.
-        runs: on equal test images, seed by seed.
+        label: name of the group, unique in a comparison.
+        heading: how it differs from other groups of the same setting; empty if there are none.
+        runs: the runs; those of one seed have the same test images.
     """
 
     setting: str
@@ -178,13 +178,13 @@ class Group:
 def score_table(runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0) -> ScoreTable:
     """Score the detectors of runs on the biased objects: the bounds, every method, and those of ``WITHOUT``.
 
-    The seeds are those that all methods have; the reference's runs stand for what all methods share.
+    The seeds are those that all methods have. Detectors that all methods share are taken from the reference's runs.
 
     Args:
-        runs: of one group.
+        runs: the runs of one group.
         reference: the method that the others are compared with.
-        draws: of the bootstrap over test images.
-        seed: of the bootstrap.
+        draws: number of bootstrap draws over test images.
+        seed: seed of the bootstrap.
 
     Raises:
         ValueError: the reference has no run, or no seed is common to all methods.
@@ -215,7 +215,7 @@ def common_seeds(runs: Iterable[FinishedRun], methods: Sequence[str]) -> tuple[i
 
 
 def by_reason(left_out: Iterable[LeftOut]) -> dict[str, list[str]]:
-    """Group labels of runs by why they were left out."""
+    """Group the labels of runs by the reason why they were left out."""
     grouped: dict[str, list[str]] = {}
     for run in left_out:
         grouped.setdefault(run.reason, []).append(run.label)
@@ -228,9 +228,9 @@ def select(
     """Return the groups that can be compared with a reference method, and all runs that are left out.
 
     Args:
-        runs: of all experiments asked for, those of each the newest first.
+        runs: the runs of all requested experiments, newest first within each.
         reference: the method that the others are compared with.
-        methods: the others; None: all.
+        methods: the other methods; None: all.
     """
     usable = runs.without(lambda run: _why_unusable(run, reference, methods))
     keyed = usable.groupby(lambda run: (run.setting, run.results["scoring"]))
@@ -273,7 +273,7 @@ def read_outcomes(results: Mapping[str, Any], file: Path) -> dict[str, list[Outc
 
 
 def _why_unusable(run: FinishedRun, reference: str, methods: Sequence[str] | None) -> str | None:
-    """Why a run is compared with no other, None if it may be."""
+    """Return why a run cannot be compared with any other; None if it can."""
     if run.unusable is not None:
         return run.unusable
     if methods is not None and run.method not in (reference, *methods):
@@ -288,7 +288,10 @@ def _why_unusable(run: FinishedRun, reference: str, methods: Sequence[str] | Non
 
 
 def _why_no_reference(run: FinishedRun, reference: str, anchors: Sequence[FinishedRun]) -> str:
-    """``anchors``: the reference's newest runs of the same setting, scored in other ways."""
+    """Return why a run has nothing to be compared with.
+
+    ``anchors`` are the reference's newest runs of the same setting, which are scored in other ways.
+    """
     if not anchors:
         return f"{reference} has no run of this setting"
     differs = differences(scored_values(run.results), scored_values(anchors[0].results))
@@ -296,7 +299,7 @@ def _why_no_reference(run: FinishedRun, reference: str, anchors: Sequence[Finish
 
 
 def _comparable(runs: Runs, reference: str) -> Runs:
-    """One run of each method at each seed that they have in common, the reference's first."""
+    """Choose one run of each method at each seed that they have in common, the reference's first."""
     by_method = runs.groupby(lambda run: run.method)
     order = sorted(by_method, key=lambda method: (method != reference, method))
     alike = {method: _of_one_configuration(by_method[method]) for method in order}
@@ -354,7 +357,10 @@ def _on_the_test_set_of(runs: Runs, ours: Runs, reference: str) -> Runs:
 
 
 def _at_common_seeds(runs: Mapping[str, Sequence[FinishedRun]], reference: str) -> Runs:
-    """Methods with many seeds come first; one that would leave no seed in common is left out."""
+    """Choose the runs at the seeds that all methods share.
+
+    Methods with many seeds are added first. A method that would leave no common seed is left out.
+    """
     of = {method: {run.seed: run for run in rows} for method, rows in runs.items()}
     seeds, chosen, left = set(of[reference]), [reference], []
     for method in sorted(of.keys() - {reference}, key=lambda name: (-len(of[name]), name)):

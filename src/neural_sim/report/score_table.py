@@ -1,6 +1,6 @@
-"""Scores of detectors over seeds, classes and test images: the one place where means, intervals and leads are computed.
+"""Scores of detectors over seeds, classes and test images: the one place that computes means, intervals and leads.
 
-All detectors of a seed are scored on one test set, so that they are compared in pairs, seed by seed and image by image.
+All detectors of a seed are scored on one test set, so that comparisons are paired, by seed and by image.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from neural_sim.report.intervals import Estimate, Sample, over_seeds_and_images,
 
 @dataclass(frozen=True)
 class Scatter:
-    """How far the score of one detector scatters: standard deviations, means over the detectors of a table.
+    """Standard deviations of one detector's score, averaged over the detectors of a table.
 
     Args:
-        seeds: between seeds, or between trainings on one distribution.
-        images: over resampled test images.
+        seeds: standard deviation between seeds, or between trainings on one distribution.
+        images: standard deviation over resampled test images.
     """
 
     seeds: float
@@ -32,7 +32,7 @@ class Scatter:
 class ScoreTable:
     """Scores (AP or accuracy, fractions) of detectors that were trained once for each seed.
 
-    A score of several classes is the mean over those that the test images show.
+    The score of several classes is the mean over those that the test images show.
 
     Args:
         detectors: names of methods, of distributions or of sources of images.
@@ -56,10 +56,10 @@ class ScoreTable:
         """Score detectors on their test images and on ``draws`` resampled sets of them.
 
         Args:
-            outcomes: of every detector, [seed][class].
+            outcomes: outcomes of every detector, [seed][class].
             classes: names of the classes, in the order of ``outcomes``.
-            draws: of the bootstrap over test images.
-            seed: of the bootstrap.
+            draws: number of bootstrap draws over test images.
+            seed: seed of the bootstrap.
         """
         point, spread = class_scores(list(outcomes.values()), draws, seed)
         return ScoreTable(tuple(outcomes), tuple(classes), point, spread)
@@ -71,7 +71,7 @@ class ScoreTable:
         return [name for name, missing in zip(self.classes, absent, strict=True) if not missing]
 
     def of_classes(self, names: Sequence[str]) -> ScoreTable:
-        """Return the table of some of the classes."""
+        """Return the table restricted to some classes."""
         labels = [self.classes.index(name) for name in names]
         return ScoreTable(self.detectors, tuple(names), self.point[..., labels], self.spread[..., labels])
 
@@ -85,7 +85,7 @@ class ScoreTable:
         return over_seeds_and_images(*self.sample(detector)).as_fraction
 
     def ahead(self, first: str, second: str) -> Estimate:
-        """Return by how much the first detector's mean score exceeds the second's."""
+        """Return the first detector's lead in mean score over the second."""
         return over_seeds_and_images(*_minus(self.sample(first), self.sample(second)))
 
     def closed(self, detector: str, start: str = "ns", goal: str = "matched") -> Estimate:
@@ -99,7 +99,7 @@ class ScoreTable:
         return dict(zip(self.classes, means.tolist(), strict=True))
 
     def scatter(self) -> Scatter:
-        """Return how far one detector's mean score over classes scatters; wants two seeds or more."""
+        """Return the scatter of one detector's mean score over classes; needs at least two seeds."""
         point, spread = mean_of_known(self.point), mean_of_known(self.spread)
         between, over_images = point.var(1, ddof=1).mean(), np.nanvar(spread, 0, ddof=1).mean()
         return Scatter(float(np.sqrt(between)), float(np.sqrt(over_images)))

@@ -1,4 +1,4 @@
-"""The table that a sweep ends with: what its runs scored before and after, by what was swept."""
+"""The table at the end of a sweep: scores of its runs before and after, by the swept settings."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ SCORED = ("ns", "learned", "matched")
 
 
 def sweep_table(folder: Path) -> str:
-    """Return the table of a sweep's runs; empty where fewer than two left results.
+    """Return the table of a sweep's runs; empty if fewer than two left results.
 
     Args:
-        folder: of the sweep, with a folder for each job, whose name begins with its number.
+        folder: the sweep's folder, with a subfolder for each job, whose name begins with the job's number.
     """
     jobs = sorted((path for path in folder.iterdir() if (path / ".hydra").is_dir()), key=_number)
     results = {job: read_json(job / "results.json") for job in jobs if (job / "results.json").is_file()}

@@ -1,4 +1,4 @@
-"""Runs in MLflow: opened when work begins, written to while it goes on, and read back."""
+"""Runs in MLflow: opened when work begins, written to while it runs, and read back later."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ BATCH = 100
 
 
 def tracking_uri(location: str) -> str:
-    """Return the URI of a tracking store: a URI as it is, a path as a SQLite file with an absolute path.
+    """Return the URI of a tracking store: a URI unchanged, a path as an absolute path of a SQLite file.
 
     Raises:
-        ValueError: an empty location.
+        ValueError: the location is empty.
     """
     if not location:
         raise ValueError("paths.mlflow is empty: want a file such as outputs/mlflow.db or a tracking URI")
@@ -50,7 +50,7 @@ def tracking_uri(location: str) -> str:
 
 
 def where(uri: str, experiment_id: str, run_id: str | None = None) -> str:
-    """Return how to look at a run or at an experiment's table of runs: an address, after the command that serves it."""
+    """Return how to open a run, or an experiment's table of runs: the command that serves it, and its address."""
     path = f"/#/experiments/{experiment_id}/runs" + (f"/{run_id}" if run_id else "") + f"?{TRAINING}"
     if uri.startswith(("http://", "https://")):
         return uri.rstrip("/") + path
@@ -62,9 +62,9 @@ def where(uri: str, experiment_id: str, run_id: str | None = None) -> str:
 class Run:
     """A run that is open in MLflow. Values that are not finite are left out, since MLflow's charts break on them.
 
-    What the store refuses for now (a server that is away, a locked database) does not stop the work: it is logged as a
-    warning, kept, and sent with what comes next, at the latest when the run is closed. ``clock`` gives the rows'
-    time in seconds since 1970.
+    A failed write (an unreachable server, a locked database) does not stop the work: it is logged as a warning, and the
+    values are kept and sent with the next write, at the latest when the run is closed. ``clock`` gives the time of the
+    rows in seconds since 1970.
     """
 
     def __init__(self, client: Any, uri: str, info: Any, clock: Callable[[], float] = time.time) -> None:
@@ -73,7 +73,7 @@ class Run:
 
     @property
     def where(self) -> str:
-        """How to look at it, see ``where``."""
+        """How to open the run in MLflow, see the function ``where``."""
         return where(self.uri, self.experiment_id, self.run_id)
 
     def log(self, metrics: Mapping[str, float], step: int = 0) -> None:
@@ -81,7 +81,7 @@ class Run:
         self.log_series({key: {step: value} for key, value in metrics.items()})
 
     def log_series(self, series: Mapping[str, Sequence[float] | Mapping[int, float]]) -> None:
-        """Write values by step, or one a step from 0, with the current time."""
+        """Write values by step, or one per step from 0, with the current time."""
         from mlflow.entities import Metric
 
         now = int(1000 * self._clock())
@@ -100,9 +100,9 @@ class Run:
 
     @contextmanager
     def fluent(self) -> Iterator[Any]:
-        """Give the module ``mlflow`` with this run's store and experiment as its own, to log models: clients cannot.
+        """Yield the module ``mlflow`` set to this run's store and experiment, to log models, which clients cannot do.
 
-        The experiment stays set afterwards; nothing else here reads it.
+        The experiment stays set afterwards; nothing else in this project reads it.
         """
         with quiet(), guard(self.uri):
             import mlflow
@@ -116,7 +116,7 @@ class Run:
                 mlflow.set_tracking_uri(before)
 
     def close(self, status: str, error: BaseException | None = None) -> None:
-        """Send what waits and end the run; what the store refuses is a warning: the results are in the run's folder.
+        """Send waiting values and end the run. Failures are only warnings, as results are in the run's folder too.
 
         Args:
             status: FINISHED, FAILED or KILLED.
@@ -167,22 +167,22 @@ def opened(
     begun: float | None = None,
     clock: Callable[[], float] = time.time,
 ) -> Iterator[Run]:
-    """Open a run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after SIGTERM or Ctrl-C.
+    """Open a run, which ends as FINISHED, as FAILED after an exception, or as KILLED after SIGTERM or Ctrl-C.
 
-    A new SQLite store is created, and every store written to, under a lock, so that workers of a sweep can share it.
-    Runs that a killed process of this machine left open are closed first, see ``close_abandoned``.
+    A SQLite store is created and written to under a lock, so that the workers of a sweep can share it. Runs that a
+    killed process of this machine left open are closed first, see ``close_abandoned``.
 
     Args:
-        uri: of the store.
-        experiment: its name; made where there is none.
-        name: of the run.
-        tags: of the run.
-        parameters: the configuration, flat.
-        begun: when the work began if that was before now, in seconds since 1970.
+        uri: URI of the store.
+        experiment: name of the experiment, which is created if it does not exist.
+        name: name of the run.
+        tags: tags of the run.
+        parameters: the configuration, flattened.
+        begun: when the work began, in seconds since 1970; None: now.
         clock: gives the time in seconds since 1970.
 
     Raises:
-        ValueError: a store that cannot be written to.
+        ValueError: the store cannot be written to.
     """
     with quiet():
         from mlflow.exceptions import MlflowException
@@ -213,10 +213,10 @@ def opened(
 
 
 def close_abandoned(client: Any) -> list[str]:
-    """End runs of processes of this machine that no longer exist: killed outright, they could not do it themselves.
+    """End the runs of this machine's processes that were killed outright and could not end them themselves.
 
     Returns:
-        The ids of the runs, which are now KILLED; a line in the log names each.
+        The ids of the runs, which are now KILLED; the log names each.
     """
     source = " and ".join(f"tags.{key} = '{value}'" for key, value in SOURCE.items())
     ids = [experiment.experiment_id for experiment in client.search_experiments()]
@@ -234,7 +234,7 @@ def close_abandoned(client: Any) -> list[str]:
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested mappings with dotted keys, by which MLflow's parameters are filtered."""
+    """Flatten nested mappings into dotted keys, by which MLflow can filter parameters."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
@@ -246,25 +246,25 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _allowed(name: str) -> str:
-    """Replace characters that MLflow does not take, which an object's name may have."""
+    """Replace the characters that MLflow does not allow but that an object's name may contain."""
     return re.sub(r"[^/\w.\- :]", "_", name)
 
 
 def _interrupted(error: BaseException) -> bool:
-    """Whether it is a signal's exception, or Ctrl-C's, or the SystemExit that Lightning makes of that."""
+    """Check whether a signal or Ctrl-C caused the exception, which may be the SystemExit that Lightning raises."""
     kinds = (Interrupted, KeyboardInterrupt)
     return any(isinstance(each, kinds) for each in (error, error.__context__, error.__cause__))
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silence what MLflow and its database say when they are imported and when a store is created."""
+    """Silence the messages of MLflow and its database on import and when a store is created."""
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for noisy in ("mlflow", "alembic", "sqlalchemy"):
             logging.getLogger(noisy).setLevel(logging.WARNING)
-        # It logs the stack of each error that it raises, which is told here in one line.
+        # It logs the traceback of each error that it raises, which our own message states in one line.
         logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
         yield
 
@@ -273,7 +273,7 @@ def connect(uri: str) -> Any:
     """Return a client of a store, which is created if it is a SQLite file that does not exist yet.
 
     Raises:
-        ValueError: a file that is no database of MLflow's, or one of a version that this one does not know.
+        ValueError: the file is not an MLflow database, or of a version that the installed MLflow does not know.
     """
     from mlflow import MlflowClient
     from mlflow.exceptions import MlflowException
@@ -289,12 +289,10 @@ def connect(uri: str) -> Any:
             client.search_experiments(max_results=1)  # creates the tables of a new database
     except MlflowException:
         raise
-    except OSError as error:  # of the lock beside the database
+    except OSError as error:  # raised by the lock next to the database
         why = error.strerror or error
         raise ValueError(f"paths.mlflow: {uri} cannot be written to ({why}); set paths.mlflow") from error
-    except (
-        Exception
-    ) as error:  # of SQLAlchemy and Alembic, on databases that are not what MLflow's version made
+    except Exception as error:  # raised by SQLAlchemy and Alembic on databases with another schema
         raise ValueError(
             f"paths.mlflow: {uri} cannot be used ({first_line(error)}); a newer MLflow may have written it: move it "
             "away, or set paths.mlflow"
@@ -303,7 +301,7 @@ def connect(uri: str) -> Any:
 
 
 def _experiment_id(client: Any, uri: str, name: str) -> str:
-    """Return the experiment, created if it does not exist, tagged as model training unless it has another tag."""
+    """Return the id of the experiment, which is created if it does not exist; tag it as model training if untagged."""
     from mlflow.exceptions import MlflowException
 
     experiment = client.get_experiment_by_name(name)
@@ -312,7 +310,7 @@ def _experiment_id(client: Any, uri: str, name: str) -> str:
         location = None if database is None else (database.parent / "mlartifacts" / name).as_uri()
         try:
             return client.create_experiment(name, artifact_location=location, tags=dict([KIND]))
-        except MlflowException as error:  # another machine was first at a server
+        except MlflowException as error:  # another machine has just created it on the server
             _log.info("mlflow: %s", error)
             experiment = client.get_experiment_by_name(name)
             if experiment is None:
@@ -327,13 +325,13 @@ class LoggedRun:
     """A run in the tracking store.
 
     Args:
-        run_id: in MLflow.
-        name: in MLflow.
+        run_id: id in MLflow.
+        name: name in MLflow.
         status: FINISHED, FAILED, ...
-        commit: of its code, or ``UNKNOWN``.
-        parameters: its configuration as MLflow keeps it, flat and as text.
+        commit: commit of its code, or ``UNKNOWN``.
+        parameters: its configuration as MLflow stores it, flattened and as text.
         files: names of its artifacts.
-        fetch: brings one of these here.
+        fetch: downloads an artifact and returns its path.
     """
 
     run_id: str
@@ -349,7 +347,7 @@ def logged_runs(uri: str, experiment: str) -> list[LoggedRun]:
     """Read all runs of an experiment that are not deleted, the latest first.
 
     Raises:
-        ValueError: no experiment of that name.
+        ValueError: there is no experiment with this name.
     """
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     with quiet():
@@ -370,10 +368,10 @@ def experiments(uri: str) -> list[str]:
 
 
 def where_runs(uri: str, experiment: str) -> str:
-    """Return how to look at an experiment's table of runs, see ``where``.
+    """Return how to open an experiment's table of runs, see ``where``.
 
     Raises:
-        ValueError: no experiment of that name.
+        ValueError: there is no experiment with this name.
     """
     with quiet():
         return where(uri, _known_id(connect(uri), uri, experiment))

@@ -1,6 +1,6 @@
 """A page in the browser that shows an object's field, the cameras of its bins, and renders with detections.
 
-Needs viser (the extra ``viewer``). What is shown is computed by ``Shots``, which does not need it.
+Needs viser (the extra ``viewer``), except for ``Shots``, which computes what the page shows.
 """
 
 from __future__ import annotations
@@ -25,16 +25,17 @@ from neural_sim.synthesis.scene import Scene
 from neural_sim.types import PinholeCamera, SceneDraw
 
 GREY = 0.5
-"""Of what is behind a render."""
+"""Grey level of the background of renders."""
 PER_BIN = 4
-"""Cameras drawn of each bin."""
+"""Number of cameras shown for each bin."""
 
 
 @dataclass(frozen=True)
 class BinCamera:
-    """A camera drawn from a bin (from 0) of probability ``p``.
+    """A camera drawn from a bin.
 
-    It has its number in the draw and its pose (OpenGL axes, object radii).
+    ``bin`` is the bin's number from 0 and ``p`` its probability. ``draw`` has the camera's scene parameters,
+    ``camera_to_world`` its pose (OpenGL axes, object radii).
     """
 
     bin: int
@@ -45,7 +46,7 @@ class BinCamera:
 
 @dataclass(frozen=True)
 class Shots:
-    """What the viewer shows of a scene. ``psi`` are distributions by name, ``detector`` detects on renders."""
+    """Computes what the viewer shows. ``psi`` has distributions by name, ``detector`` detects objects in renders."""
 
     scene: Scene
     psi: Mapping[str, Float[Tensor, "objects K"]]
@@ -60,7 +61,10 @@ class Shots:
         magnification: float | None = None,
         weights: tuple[float, ...] = (),
     ) -> SceneDraw:
-        """Scene parameters of one image; ``distance`` in the distribution's unit, ``weights`` of the anchor lights."""
+        """Return the scene parameters of one image, with the distance in the distribution's unit.
+
+        ``weights`` are those of the anchor lights.
+        """
 
         def one(value: float) -> Tensor:
             return torch.tensor([value], dtype=torch.float32)
@@ -73,7 +77,7 @@ class Shots:
 
     @torch.no_grad()
     def picture(self, label: int, draw: SceneDraw, above: float = 0.3) -> UInt8[np.ndarray, "height width 3"]:
-        """Render the object before grey, with the detector's boxes whose score is at least ``above``."""
+        """Render the object on grey, with the detector's boxes whose score is at least ``above``."""
         shown = self.scene.render(label, draw)
         behind = torch.full_like(shown.rgb, GREY).movedim(-1, 1)
         image = composite(shown.rgb, shown.opacity, behind).clamp(0.0, 1.0)
@@ -91,7 +95,7 @@ class Shots:
     def cloud(self, label: int, views: int = 12, size: int = 96) -> tuple[np.ndarray, np.ndarray]:
         """Return points [n, 3] of the field's surface in object radii, and their colours [n, 3] in [0, 1].
 
-        They are what ``views`` renders round the object show, from every height and under equal weights of the lights.
+        They are the surface points in ``views`` renders around the object, from every height, under equal lights.
         """
         subject = self.scene.fields[label]
         turn = torch.arange(views) * (math.pi * (3.0 - math.sqrt(5.0)))  # a spiral of the golden angle
@@ -103,16 +107,14 @@ class Shots:
         weights = poses.new_full((views, lights), 1.0 / lights) if lights else None
         maps, depth = subject.surface(camera, poses, weights)
         rays = cameras.rays(camera, poses)
-        along = -(rays.directions * poses[:, None, None, :3, 2]).sum(
-            -1
-        )  # of a ray's unit length, along the axis
+        along = -(rays.directions * poses[:, None, None, :3, 2]).sum(-1)  # depth per unit length of a ray
         points = rays.origins + rays.directions * (depth / along)[..., None]
         solid = depth > 0.0
         colours = maps.rgb[solid] / maps.opacity[solid][:, None].clamp_min(1e-3)
         return points[solid].cpu().numpy(), colours.clamp(0.0, 1.0).cpu().numpy()
 
     def bin_cameras(self, label: int, which: str, factor: str, seed: int = 0) -> list[BinCamera]:
-        """``PER_BIN`` cameras of every bin of a factor, drawn as images of that bin are."""
+        """Draw ``PER_BIN`` cameras of every bin of a factor, in the same way as images of that bin."""
         distribution, psi = self.scene.distribution, self.psi[which][label].float()
         p = distribution.probabilities(psi)[factor]
         draw = distribution.probes(factor, PER_BIN, psi, torch.Generator().manual_seed(seed), psi.dtype)
@@ -125,7 +127,7 @@ class Shots:
 
 
 def colour(p: float, most: float) -> tuple[int, int, int]:
-    """From grey for 0 to blue for the likeliest bin."""
+    """Return a colour between grey for 0 and blue for the most likely bin."""
     part = 0.0 if most <= 0.0 else p / most
     low, high = np.array([205, 205, 205]), np.array([0, 90, 178])
     r, g, b = (low + part * (high - low)).round().astype(int).tolist()
@@ -133,13 +135,13 @@ def colour(p: float, most: float) -> tuple[int, int, int]:
 
 
 class Viewer:
-    """The page: a 3D view of the field and the cameras of one factor's bins, and sliders for a render next to it.
+    """The page: a 3D view of the field and the cameras of one factor's bins, next to a render with its sliders.
 
-    A click on a camera moves the sliders there.
+    A click on a camera moves the sliders to it.
 
     Args:
-        shots: what it shows.
-        port: of the page, on this machine's own address alone; the next free one where it is taken.
+        shots: computes what the page shows.
+        port: the page's port, on this machine's own address only; the next free one if it is taken.
         which: the distribution that is shown first.
 
     Raises:
@@ -192,27 +194,27 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """The page's address."""
         return f"http://127.0.0.1:{self.server.get_port()}"
 
     @property
     def label(self) -> int:
-        """Of the object that is shown."""
+        """The label of the object shown."""
         return self.shots.scene.names.index(self.object.value)
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Render the object at the sliders."""
+        """Render the object as the sliders say."""
         zoom = None if self.magnification is None else self.magnification.value
         weights = tuple(light.value for light in self.lights)
         draw = self.shots.draw(self.phi.value, self.rho.value, self.distance.value, zoom, weights)
         return self.shots.picture(self.label, draw, self.above.value)
 
     def show_picture(self) -> None:
-        """Render anew."""
+        """Update the render."""
         self.image.image = self.picture()
 
     def show_object(self) -> None:
-        """All of the chosen object: its field, the cameras, and a new render."""
+        """Show everything of the chosen object: its field, the cameras, and a new render."""
         self.show_field()
         self.show_bins()
         self.show_picture()
