@@ -1,4 +1,4 @@
-"""Runs on a disk that fills, or becomes read-only, at some moment: `python benchmarks/disks.py --out disks.json`.
+"""Runs on a disk that fills, or is read-only after some time: `python benchmarks/disks.py --out disks.json`.
 
 The store, the database, and the folders of the runs lie on a RAM disk of a given size. What a run says when it cannot
 write, and whether its status tells, is noted; then the disk gets room, and the same command must end with the bits of a
@@ -45,24 +45,36 @@ def changed(folder: Path, options: str) -> None:
 def trial(
     folder: Path, empty: Path, bits: dict[str, str], size: str, seconds: float | None
 ) -> dict[str, Any]:
-    """Run the command on a disk of some size, which becomes read-only after some seconds; then again with room."""
-    log = folder.parent / "first.log"
+    """Run the command where it cannot write, then again where it can.
+
+    Args:
+        folder: where the disk is mounted.
+        empty: a new database.
+        bits: those of a run that always had room.
+        size: the disk's size.
+        seconds: when a first run is killed, whose disk then becomes read-only; None for a disk that fills.
+    """
+    log = folder.parent / "said.log"
+    log.unlink(missing_ok=True)
     with disk(folder, size):
         place = Place(folder)
         shutil.copy(empty, folder / "mlflow.db")
-        process = place.start(log)
         if seconds is not None:
-            process.join(seconds)
-            subprocess.run(["mount", "-o", "remount,ro", folder], check=False)
+            killed = place.start(folder.parent / "killed.log")
+            killed.join(seconds)
+            killed.kill()
+            killed.join()
+            changed(folder, "ro")
+        process = place.start(log)
         process.join()
-        said, status = log.read_text(errors="replace"), process.exitcode
+        said = log.read_text(errors="replace")
         changed(folder, f"rw,size={ROOMY}")
         right = all(bits.get(name) == bit for name, bit in place.stored().items())
-        again = place.start(folder.parent / "second.log")
+        again = place.start(folder.parent / "again.log")
         again.join()
         same = again.exitcode == 0 and place.bits() == bits
     return {
-        "size": size, "read_only_after": seconds, "status": status, "traceback": "Traceback" in said,
+        "size": size, "read_only_after": seconds, "status": process.exitcode, "traceback": "Traceback" in said,
         "said": [line for line in said.splitlines() if line.startswith("neural-sim:")][-1:],
         "intact": right, "same": same,
     }  # fmt: skip
@@ -72,7 +84,7 @@ def main() -> None:
     """Run all trials, and write the document."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--full", type=int, default=10, help="disks too small for the run")
-    parser.add_argument("--read-only", type=int, default=5, help="disks that become read-only meanwhile")
+    parser.add_argument("--read-only", type=int, default=5, help="disks that are read-only after some time")
     parser.add_argument("--out", type=Path, help="a JSON file")
     given, random = parser.parse_args(), Random(0)
     logging.getLogger("neural_sim.stages.store").setLevel(logging.ERROR)
