@@ -2,8 +2,8 @@
 
 The code scales the hidden units of the colour head. The gains 1 + W c are the same at every sample, so that a field
 under one code is as fast as one without; and the colour's logits are affine in the code, as shading is linear in light.
-(The alternative, to append the code to the hidden layer's input, amounts to a shift of its bias; it renders a side
-under a light that no view showed it in about 2 dB worse.)
+(The alternative, appending the code to the hidden layer's input, amounts to a shift of its bias. On sides rendered
+under a light in which no view shows them, it is about 2 dB worse.)
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class AppearanceField(RadianceField):
     ``learned`` codes of ``code_size`` numbers are fitted, one for each light of the training views or one for each
     view. The ``anchors``, which an illumination weighs, are k affine combinations of them: rows of ``mixing`` (k,
     learned) add up to 1. With ``view_dependent`` the head also sees the viewing direction, which Lambertian objects do
-    not need. Queried without a code, the field has the mean of its anchors.
+    not need. A query without a code uses the mean of the anchors.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class AppearanceField(RadianceField):
         return self.mixing @ self.codes
 
     def lit(self, code: Float[Tensor, "code"], rates: Float[Tensor, "q code"] | None = None) -> LitField:
-        """Return this field under one code, which moves at ``rates`` (None: it does not)."""
+        """Return this field under one code, which changes at ``rates`` (None: it is constant)."""
         gain = self.gain(code)
         gain_rates = (
             gain.new_zeros(0, len(gain)) if rates is None else functional.linear(rates, self.code.weight)
@@ -150,7 +150,7 @@ class AppearanceField(RadianceField):
 
 
 class LitField(RadianceField):
-    """An appearance field under one code; shares its tensors. Its colour also has derivatives by the code's rates."""
+    """An appearance field under one code, with shared tensors; its colour also has derivatives by the code's rates."""
 
     def __init__(
         self, field: AppearanceField, gain: Float[Tensor, "width"], gain_rates: Float[Tensor, "q width"]
@@ -211,7 +211,7 @@ class LitField(RadianceField):
         velocities: Float[Tensor, "m samples 3"],
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See the base class; m may be 0. In closed form: a moving light costs one small product a sample."""
+        """See the base class, but m may be 0. In closed form: a moving light costs one small product per sample."""
         field, grid = self.field, self.field.grid
         raw, raw_rates = grid.raw_with_tangents(positions, velocities)
         before = field.into(field.seen(raw, directions))

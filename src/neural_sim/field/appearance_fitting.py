@@ -1,4 +1,4 @@
-"""Fitting of a field with appearance codes, and its scores on views under other lights."""
+"""Fit a field with appearance codes, and score it on views under other lights."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ class AppearanceFitting(Fitting):
             the look of a side under one light is learned from all views of that side. Otherwise, and for photographs,
             each view learns its own code (NeRF in the Wild).
         anchors: number of views, evenly spread, whose codes become the anchors if no light weights are known.
-        transients: learn what single views show in front of the object, and how uncertain each pixel is; for
-            photographs, in which somebody may walk through the picture. Rendered views have none. Transients are used
-            only once the grid's cells have been refined or pruned: before, they would explain the object itself.
+        transients: learn what single views show in front of the object, and how uncertain each pixel is. This is for
+            photographs, in which somebody may walk through the picture; rendered views have no transients. They are
+            used only after the first refinement or pruning of the grid, because until then they would explain the
+            object itself.
         transient_penalty: lambda_u of NeRF in the Wild, on the transients' optical depth.
     """
 

@@ -27,8 +27,8 @@ class RadianceField(nn.Module, ABC):
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
         """Return density ``sigma`` (per object radius, at least 0) and colour in [0, 1].
 
-        ``directions`` are unit and point away from the camera. Differentiable in both arguments, forward and
-        reverse mode.
+        ``directions`` are unit vectors that point away from the camera. The result is differentiable in both arguments,
+        in forward and reverse mode.
         """
 
     def query_with_tangents(
@@ -45,7 +45,7 @@ class RadianceField(nn.Module, ABC):
     ]:
         """Return ``query``, with m >= 1 derivatives as positions move at ``velocities`` and directions at ``turns``.
 
-        A field with a moving light has more derivatives of colour than of density, the last ``light_rates`` of them.
+        Under a moving light, colour has ``light_rates`` more derivatives than density; they come last.
 
         The base class uses Jacobian-vector products; a field that knows its own derivative overrides this.
         """
@@ -61,12 +61,12 @@ class RadianceField(nn.Module, ABC):
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
         """Return the distances at which to ``query`` the field along rays of shape (rays, 3).
 
-        Deterministic and detached: the same rays always give the same distances. Samples behind a transmittance
-        below ``termination`` may be skipped; at 0 none is.
+        They are deterministic (the same rays always give the same distances) and detached. Samples behind a
+        transmittance below ``termination`` may be skipped; at 0, none are.
         """
 
     def with_step(self, multiple: float) -> RadianceField:
-        """Return this field, tensors shared, sampled at ``multiple`` times its step; itself if it has no step."""
+        """Return this field, with shared tensors, sampled at ``multiple`` times its step; itself if it has no step."""
         return self
 
     @torch.no_grad()
@@ -80,9 +80,9 @@ class RadianceField(nn.Module, ABC):
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         """Compute premultiplied colour and opacity of rays (rays, 3) by quadrature on the samples of ``sample``.
 
-        Not differentiable. ``span`` are the rays' distances from the method ``span``; with ``skip_empty``, space known
-        to be empty is skipped. Neither changes a pixel, and a field without known empty space ignores both.
-        ``surface``, if given, records where these rays lose half of their light.
+        It is not differentiable. ``span`` has the rays' distances from the method ``span``; with ``skip_empty``, space
+        known to be empty is skipped. Neither changes a pixel, and fields that know no empty space ignore both.
+        ``surface``, if given, records where the rays lose half of their light.
         """
         samples = self.sample(rays, termination)
         sigma, rgb = self.query(*sample_points(rays, samples))

@@ -46,7 +46,7 @@ class Extinction:
         return before, before < self._deepest, alive
 
     def opacity(self) -> Float[Tensor, "rays"]:
-        """Return what all counted samples absorb together: the sum of their weights."""
+        """Return the fraction of light that all counted samples absorb: the sum of their weights."""
         return -torch.expm1(-self._depth)
 
 

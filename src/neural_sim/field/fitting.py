@@ -1,4 +1,4 @@
-"""Fitting of a grid field, coarse to fine, only where a silhouette or a learned density requires it."""
+"""Fit a grid field coarse to fine, with cells only where a silhouette or a learned density requires them."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class GridFitting(Fitting):
 
 
 def _large_parts(occupied: Bool[Tensor, "nx ny nz"], seen: Bool[Tensor, "cells"]) -> Bool[Tensor, "cells"]:
-    """Find the cells in connected parts that are large compared with the largest; others are errors in the air."""
+    """Find the cells in connected parts of at least ``LARGE`` times the largest one; smaller parts are floaters."""
     grid = torch.zeros_like(occupied)
     grid[occupied] = seen
     parts = np.zeros(tuple(grid.shape), dtype=np.int64)

@@ -39,7 +39,7 @@ EMPTY_DENSITY = -1e4
 class GridField(RadianceField):
     """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, at any scale of the grid.
 
-    ``features`` numbers at each vertex make the colour. With ``head_width`` 0 the first three pass through a sigmoid
+    ``features`` numbers at each vertex give the colour. With ``head_width`` 0 the first three pass through a sigmoid
     (no view dependence; a Lambertian object under a fixed light needs none); otherwise a head with one hidden layer
     sees them and the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is the
     argument of softplus in a new field; ``density_gain`` lets density learn that much faster than colour. A new field
@@ -90,7 +90,7 @@ class GridField(RadianceField):
         return self.step_cells * self.edge
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
-        """Move and cast like any module; refuse a type that cannot distinguish two places in a cell."""
+        """Move and cast like any module, but reject a dtype that cannot resolve positions within a cell."""
         # Half precision would not pay for colour alone either: decoding is 6 % of a render on a CPU.
         wanted = fn(self.table.detach()[:0]).dtype
         if wanted not in (torch.float32, torch.float64):
@@ -129,8 +129,7 @@ class GridField(RadianceField):
         before, table, old_cell, old_origin = self.occupancy, self.table, self.edge, self.origin
         corners = self.corners
         coordinates = self._set_cells(occupied, origin, cell)
-        # New vertices lie on faces of old cells; moved slightly towards the inside of an occupied cell, each finds a
-        # row.
+        # New vertices lie on the boundaries of old cells; nudged into an occupied one, each finds a row.
         local = (origin - old_origin + coordinates.to(table.dtype) * cell) / old_cell
         rows = _interpolate_from(local, before, corners, table)
         self.table = nn.Parameter(torch.cat([rows, table[-1:]]))
@@ -152,7 +151,7 @@ class GridField(RadianceField):
     def raw(
         self, positions: Float[Tensor, "samples 3"], cells: Int[Tensor, "samples"] | None = None
     ) -> Float[Tensor, "samples channels"]:
-        """Interpolate table rows. ``cells`` may have the known cell numbers of the positions (-1: empty)."""
+        """Interpolate table rows. ``cells`` are the positions' cell numbers (-1: empty), if already known."""
         local = (positions - self.origin) / self.edge
         base = local.detach().floor()
         corners = self._corners_of(lookup(base, self.occupancy) if cells is None else cells)
@@ -260,7 +259,7 @@ class GridField(RadianceField):
         self, decode: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]], directed: bool, rays: Rays,
         termination: float, span: Span | None, skip_empty: bool, surface: Surface | None,
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:  # fmt: skip
-        """Do as ``trace``, with table rows decoded by ``decode``; ``directed``: it needs the samples' directions."""
+        """Trace rays with ``decode`` for table rows; ``directed`` says whether it needs the samples' directions."""
         colour = rays.origins.new_zeros(len(rays.origins), 3)
         extinction = Extinction(len(rays.origins), termination, rays.origins)
 
@@ -307,7 +306,7 @@ def _resize_to_state(field: nn.Module, state: dict[str, Tensor], prefix: str, *_
 def _interpolate_from(
     local: Float[Tensor, "vertices 3"], occupancy: Occupancy, corners: Tensor, table: Tensor
 ) -> Float[Tensor, "vertices channels"]:
-    """Return an old table's values at grid vertices, each from any occupied one of its eight neighbouring cells."""
+    """Interpolate an old table at grid vertices, each in any occupied cell of the eight around it."""
     result = table.new_zeros(len(local), table.shape[1])
     missing = torch.arange(len(local), device=local.device)
     for corner in CORNERS:

@@ -32,9 +32,10 @@ def visual_hull(
 
     A cell is removed if some view that sees its centre has no pixel above ``alpha_threshold`` within the circle that
     the cell can cover, so that the hull is never too small. With photographs (``views.known``), more than the fraction
-    ``DISSENT`` of those that show the cell must agree. Returns cells, origin and edge length in object radii.
+    ``DISSENT`` of those that show the cell must agree to remove it. Returns cells, origin and edge length in object
+    radii.
 
-    Raises ValueError for another resolution, or if the views leave no cell (their silhouettes contradict each other).
+    Raises ValueError if the resolution is invalid or no cell is left (the silhouettes contradict each other).
     """
     check(resolution, Resolution, "visual_hull.resolution")
     pose = views.camera_to_world
@@ -61,7 +62,7 @@ def visual_hull(
 
 
 def pixels_across(views: PosedViews, length: float) -> int:
-    """Return how many pixels a length of the unit sphere covers at most in any view, plus one for partial pixels."""
+    """Return the largest number of pixels that a length in the unit sphere covers in any view, rounded up."""
     nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
     return math.ceil(max(focal_lengths(views.camera)) * length / nearest) + 1
 
@@ -69,7 +70,7 @@ def pixels_across(views: PosedViews, length: float) -> int:
 def _inside_all(
     views: PosedViews, centres: Float[Tensor, "cells 3"], radius: float, alpha_threshold: float
 ) -> Bool[Tensor, "cells"]:
-    """Whether every view that sees a centre finds the object within ``radius`` of it; unseen centres stay."""
+    """Find the centres within ``radius`` of the object in the views that see them; unseen centres stay."""
     camera, reach = views.camera, pixels_across(views, radius)
     (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
     mask = views.images[..., 3] > alpha_threshold

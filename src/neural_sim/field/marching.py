@@ -1,4 +1,4 @@
-"""Samples where rays meet occupied cells: uniform steps on a fixed lattice that skip empty space and ended rays.
+"""Samples of rays in occupied cells, at uniform steps on a fixed lattice that skip empty space and terminated rays.
 
 The lattice of a ray is t_k = (k + phase) step from the ray's origin, whatever is skipped: skipping empty space
 changes no sample, and the same ray always has the same distances. Coordinates are separate contiguous arrays, which
@@ -52,7 +52,7 @@ Visitor = Callable[[Wave], Bool[Tensor, "n"]]
 
 @dataclass(frozen=True)
 class _Walk:
-    """Rays in cells of the grid: one array for each coordinate, the last lattice step inside, the lattice's phase."""
+    """Rays in cell units: one array for each coordinate, the last lattice step inside, and the lattice's phase."""
 
     origin: Axes
     direction: Axes
@@ -66,7 +66,7 @@ class _Walk:
         return _Walk((x, y, z), (u, v, w), last, phase)
 
     def at(self, travelled: Float[Tensor, "n *steps"]) -> Axes:
-        """Return positions after travelling the given number of cells."""
+        """Return positions after travelling the given distances, in cells."""
         shape = (-1,) + (1,) * (travelled.ndim - 1)
         x, y, z = (
             torch.addcmul(start.view(shape), along.view(shape), travelled)
@@ -105,7 +105,7 @@ def march(
         there = (away <= length // (4 * COARSENING)).nonzero()[:, 0]
         going = following <= walk.last
         if len(there):
-            # Most rays arrive together, so that a selection seldom copies a part of the rays.
+            # Most rays arrive together, so that a copy of some of them is seldom needed.
             whole = len(there) == len(ray)
             arrived = walk if whole else walk.select(there)
             number, first = (
@@ -161,7 +161,7 @@ def lookup(local: Float[Tensor, "*samples 3"], occupancy: Occupancy) -> Int[Tens
 def _enter(
     rays: Rays, occupancy: Occupancy, step: float, phase: Float[Tensor, "rays"] | float, span: Span | None
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], _Walk]:
-    """Return the numbers of the rays that meet the grid's box, their first lattice steps inside, and them in cells."""
+    """Return the indices of the rays that meet the grid's box, their first lattice steps inside, and all the rays."""
     origin = ((rays.origins - occupancy.origin) / occupancy.cell).t().contiguous()
     # A direction component of exactly zero would divide by zero; the smallest slope gives the same span.
     slope = rays.directions.t().contiguous()
@@ -193,7 +193,7 @@ def _enter(
 def _leap(
     walk: _Walk, ahead: Float[Tensor, "n"], occupancy: Occupancy, nearest: Int[Tensor, "coarse"], unit: float
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return the coarse cells to the nearest occupied one, and the first lattice step surely behind the empty ones.
+    """Return distances to the nearest occupied coarse cell, and the first lattice steps beyond known empty space.
 
     A ray whose coarse cell is d > 0 cells from the nearest occupied one may jump to the exit of the cube of
     d - 1 cells around its own.

@@ -37,7 +37,7 @@ def positional_encoding(
 
 
 class NerfNetwork(nn.Module):
-    """Position to density, position and direction to colour. All default sizes are NeRF's."""
+    """Maps positions to density, and positions with directions to colour. The field's default sizes are NeRF's."""
 
     def __init__(self, width: int, depth: int, position_frequencies: int, direction_frequencies: int) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ class MLPField(RadianceField):
         return dict(self._settings)
 
     def with_step(self, multiple: float) -> MLPField:
-        """See the base class; takes fewer samples in both passes, but at least two."""
+        """See the base class; a longer step takes fewer samples in both passes, but at least two."""
         if multiple == 1.0:
             return self
         other = copy.copy(self)
@@ -156,9 +156,10 @@ class MLPField(RadianceField):
     def sample_fine(
         self, rays: Rays, coarse: PackedSamples, generator: torch.Generator | None
     ) -> PackedSamples:
-        """Join coarse distances with new ones where the coarse weights are; each sample represents the ray around it.
+        """Join the coarse distances with new ones, distributed in proportion to the coarse weights.
 
-        A ray has coarse_samples + fine_samples samples, or none if it misses the unit sphere.
+        Each sample represents the part of the ray around it. A ray has coarse_samples + fine_samples samples, or none
+        if it misses the unit sphere.
         """
         sigma, _ = self.query_coarse(*sample_points(rays, coarse))
         weights = render_weights(sigma, coarse).view(-1, self.coarse_samples)
@@ -219,7 +220,7 @@ def _initialise(module: nn.Module, generator: torch.Generator) -> None:
 class MLPFitting(Fitting):
     """Fits both networks at once (NeRF, Eq. 6), with stratified noise in the sample distances.
 
-    Rays of all pixels are used: only rays that miss the object teach that space far from it is empty.
+    Rays of all pixels are used, because only rays that miss the object show that the space around it is empty.
     """
 
     field: MLPField

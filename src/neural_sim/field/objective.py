@@ -46,10 +46,10 @@ class Fitting(ABC):
 
     @abstractmethod
     def advance(self, step: int) -> bool:
-        """Act after ``step`` steps; return whether the field's parameters were replaced."""
+        """Change the field's structure if due after ``step`` steps; return whether its parameters were replaced."""
 
     def state(self) -> dict[str, Any] | None:
-        """Return what a step passes on, except the optimiser's state; None if a fit cannot resume at this step.
+        """Return what the next step needs, except the optimiser's state; None if a fit cannot resume at this step.
 
         A fitting that never returns a state does not resume interrupted runs.
         """

@@ -1,4 +1,4 @@
-"""Which cells of a grid can hold anything: a packed numbering of them, and the distance to the nearest one."""
+"""The occupied cells of a grid: a packed numbering of them, and the distance to the nearest one."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ FARTHEST = 16
 class Occupancy:
     """Cells of edge ``cell`` (object radii) from corner ``origin``.
 
-    ``index`` is -1 in an empty cell, else the cell's number in x-major order. ``distance`` is, for every coarse cell
-    of ``COARSENING`` cubed fine ones, the Chebyshev distance to the nearest occupied one (0: itself), up to
+    ``index`` is -1 in empty cells, and elsewhere the cell's number in x-major order. ``distance`` is, for every coarse
+    cell of ``COARSENING`` cubed fine ones, the Chebyshev distance to the nearest occupied one (0: itself), up to
     ``FARTHEST``.
     """
 

@@ -21,7 +21,7 @@ small one. The largest number is a CPU's."""
 
 @dataclass(frozen=True)
 class SeenPixels:
-    """Flat indices into [views, height, width], and what is known of the pixels' rays."""
+    """Flat pixel indices into [views, height, width], and the spans of the pixels' rays if known."""
 
     pixel: Int[Tensor, "rays"]
     span: Span | None

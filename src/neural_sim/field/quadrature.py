@@ -1,9 +1,9 @@
 """Samples along rays without padding, and volume rendering by quadrature over them, as pure functions.
 
 The quadrature is Max's (1995; NeRF, Mildenhall et al. 2020, Eq. 3). Sums over a ray are differences of one running sum
-over all samples; unlike scatters, it is fast on a CPU and has both derivative modes. It runs in float64, and no sample
-counts more than ``OPAQUE_DEPTH``, so that a ray late in the pack loses no digits to those before it: N samples have an
-error of N eps of float64 times the sum of their counted depths.
+over all samples; unlike a scatter, it is fast on a CPU and has both derivative modes. It runs in float64, and no sample
+counts more than ``OPAQUE_DEPTH``, so that rays late in the pack keep their precision: the error for N samples is N
+times the float64 eps times the sum of their counted depths.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class PackedSamples:
         """Return the samples ``begin`` to ``end`` - 1, which belong to rays ``first`` to ``last`` - 1, numbered from 0.
 
         ``begin`` and ``end`` are in ``starts``. They are arguments because reading them here would make the host wait
-        for the device once a batch.
+        for the device once per batch.
         """
         return PackedSamples(
             self.ray[begin:end] - first,
@@ -88,7 +88,7 @@ def sum_rays(
 
 
 def _running(values: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples channels"]:
-    """Sum up the samples one after the other, channel by channel unless on a CPU.
+    """Compute running sums over samples, channel by channel except on a CPU.
 
     CUDA adds the rows of a matrix sequentially, but a single row in parallel.
     """
@@ -111,7 +111,7 @@ def render_weights(sigma: Float[Tensor, "samples"], samples: PackedSamples) -> F
 def composite(
     sigma: Float[Tensor, "samples"], rgb: Float[Tensor, "samples 3"], samples: PackedSamples
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-    """Compute premultiplied colour and opacity of each ray. No last interval is infinite: light may pass through."""
+    """Compute premultiplied colour and opacity of each ray. The last interval is finite, so light may pass through."""
     weights = render_weights(sigma, samples)[:, None]
     pixels = sum_rays(torch.cat([weights * rgb, weights], -1), samples)
     return pixels[:, :3], pixels[:, 3]
@@ -155,10 +155,11 @@ def composite_with_gradient(
 ]:
     """Compute ``composite`` as RGBA, and its derivatives.
 
-    These are the derivatives by motion of all of a ray's samples along x, y or z; by motion in proportion to their
-    distances; and, for colour, by the q = n - 3 rates that change only colour. The first three rates are spatial; the
-    densities of the others are ignored. A sample's density adds its own colour, as far as light passes through it, and
-    removes everything behind it: with tau = sigma delta the pixel C changes by T exp(-tau) c - sum_{j behind} w_j c_j.
+    The derivatives are those with respect to a shift of all samples of a ray along x, y or z; to such a shift in
+    proportion to the samples' distances; and, for colour, to the q = n - 3 rates that change only colour. The first
+    three rates are spatial; the densities of the others are ignored. A sample's density adds its own colour, as far as
+    light passes through the sample, and removes everything behind it: with tau = sigma delta, the pixel C changes by
+    T exp(-tau) c - sum_{j behind} w_j c_j.
     """
     depth, weights, passed = _passage(sigma, samples)
     weights = weights[:, None]

@@ -1,4 +1,4 @@
-"""How well a field shows its object: scores on held-out views, and pictures for the user to judge."""
+"""The quality of a field: scores on held-out views, and pictures for the user to judge."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Placed:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a field shows an object, with pictures for the user to judge.
+    """The quality of an object's field, with pictures for the user to judge.
 
     Args:
-        psnr: PSNR in dB on the object's pixels of the held-out views; None without any.
+        psnr: PSNR in dB on the object's pixels of the held-out views; None if there are no such views.
         ssim: SSIM on these pixels of the views that are shown.
         cells: number of a grid's cells; None for other fields.
         views: held-out views over white, their masks and the field's renders of them, as bytes.

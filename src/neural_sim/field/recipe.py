@@ -1,4 +1,4 @@
-"""How a field is fitted to posed views: the configured recipe, its training loop, and a field's stored form."""
+"""Fit a field to posed views: the configured recipe, its training loop, and the stored form of fields."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class FieldRecipe:
     ) -> tuple[RadianceField, list[dict[str, Any]]]:
         """Return the fitted field, and its scores on the last ``held_out`` views against steps and seconds.
 
-        The fit resumes where an earlier run left it, according to ``checkpoint``.
+        The fit resumes from ``checkpoint`` where an earlier run left off.
         """
         placed = views.to(device)
         with torch.random.fork_rng(devices=[]):
@@ -125,7 +125,7 @@ def field_state(field: RadianceField) -> dict[str, Any]:
 
 
 def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
-    """Invert ``field_state``, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
+    """Rebuild a field, in evaluation mode, from its ``field_state``. Raises ``ValueError`` for an unknown kind."""
     if saved.get("kind") not in KINDS:
         raise ValueError(f"field: unknown kind {saved.get('kind')!r}, want one of {sorted(KINDS)}")
     field = KINDS[saved["kind"]](**saved["settings"])
@@ -135,7 +135,7 @@ def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
 
 @validated
 class RadianceFieldModule(lightning.LightningModule):
-    """Fits a field to ``views`` by Adam and scores it on ``held_out``.
+    """Fits a field to ``views`` with Adam and scores it on ``held_out``.
 
     One step is one batch of rays; the learning rate falls exponentially to ``final_rate`` of its start over ``steps``.
     The held-out views are rendered every ``score_every`` steps (0: only at the end); each score is a row of
@@ -180,7 +180,7 @@ class RadianceFieldModule(lightning.LightningModule):
         _log.info("field: resumes after step %d/%d of an interrupted run", self._steps_done, self.steps)
 
     def _state(self) -> dict[str, Any] | None:
-        """Return everything that a step passes on, on the CPU; None if a fit cannot resume at this step."""
+        """Return everything that the next step needs, on the CPU; None if a fit cannot resume at this step."""
         fitting = self.fitting.state()
         optimiser = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
         return fitting and {

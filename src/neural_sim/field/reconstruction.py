@@ -46,7 +46,7 @@ def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
     volume[where.unbind(1)] = least_alpha(views, centres)
     if not bool((volume > LEVEL).any()):
         raise ValueError(f"reconstruct: no point lies within the masks of all {len(views)} views")
-    padded = functional.pad(volume, (1, 1, 1, 1, 1, 1)).cpu().double().numpy()  # closed where the grid ends
+    padded = functional.pad(volume, (1, 1, 1, 1, 1, 1)).cpu().double().numpy()  # closed at the grid's border
     require("photos", "meshes from silhouettes")
     from skimage.measure import marching_cubes
 

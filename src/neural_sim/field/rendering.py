@@ -39,7 +39,7 @@ def render_samples(
 def render_packed(
     field: RadianceField, rays: Rays, termination: float
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-    """Do as ``render_samples`` on the samples that the field itself chooses."""
+    """Render like ``render_samples``, on the samples that the field itself chooses."""
     return render_samples(field, rays, field.sample(rays, termination))
 
 
@@ -51,8 +51,8 @@ def render_with_tangents(
 
     Derivatives by a moving light (see ``RadianceField.light_rates``) follow these m.
 
-    One pass over the samples gives both, about ``samples_at_once`` at a time: a sample at distance t moves at
-    o' + t d'. Many rates cost as much as a few (``_by_ray_numbers``).
+    One pass over the samples, about ``samples_at_once`` at a time, gives pixels and derivatives: a sample at distance t
+    moves at o' + t d'. Many rates cost no more than a few (``_by_ray_numbers``).
     """
     samples = field.sample(rays, termination)
     differentiate = _with_tangents if len(rates.origins) <= FEW else _by_ray_numbers

@@ -1,4 +1,4 @@
-"""How well a field shows views: the error that fitting minimises, and scores on views to which it was not fitted.
+"""Scores of a field on views: the error that fitting minimises, and image metrics on held-out views.
 
 A field with appearance codes is scored on each view under a code fitted to the view's left half.
 """
@@ -22,7 +22,7 @@ Rendering = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]
 
 
 def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, ""]:
-    """Compute the mean square colour error over a background drawn uniformly in [0, 1], in closed form.
+    """Compute the mean squared colour error over a background drawn uniformly in [0, 1], in closed form.
 
     With d the error of premultiplied colour, a that of opacity and b the background, the pixel's error is d - a b;
     E b = 1/2 and E b^2 = 1/3. ``pixels`` are premultiplied RGBA.
@@ -31,7 +31,7 @@ def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Flo
 
 
 def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, "rays 3"]:
-    """Return the square error of each ray and channel; ``expected_error`` is their mean."""
+    """Return the expected squared error of each ray and channel; ``expected_error`` is their mean."""
     colour = rendering[0] - pixels[:, :3]
     opacity = (rendering[1] - pixels[:, 3])[:, None]
     return colour.square() - colour * opacity + opacity.square() / 3.0
@@ -57,9 +57,9 @@ def compare(
 ) -> dict[str, float]:
     """Score premultiplied renders against views over white.
 
-    The scores are ``psnr``, ``ssim``, and ``psnr_foreground`` where alpha is above 0.
+    The scores are ``psnr``, ``ssim``, and ``psnr_foreground``, the PSNR where alpha is above 0.
 
-    PSNR is in dB, the mean over views of each view's value; SSIM is torchmetrics' default (Gaussian window, range 1).
+    PSNR is in dB, averaged over views; SSIM is torchmetrics' default (Gaussian window, range 1).
     """
     shown, target = (
         over_white(image).movedim(-1, 1).clamp(0.0, 1.0) for image in (rendered, premultiplied(images))

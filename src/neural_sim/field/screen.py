@@ -1,4 +1,4 @@
-"""Which pixels can see occupied space, and at which distances: coarse cells are projected before any ray is cast."""
+"""Find the pixels that can see occupied space, and at which distances, by projecting coarse cells."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def screen_span(
 ) -> Span:
     """Return distances between which rays of the image's ``rows`` can meet balls of ``radius`` around ``centres``.
 
-    They are never too narrow; near > far if a pixel sees no ball. Each ball is drawn as one block of pixels, with its
-    nearest and farthest distance; all are then widened by as many blocks as the largest ball covers. Blocks grow with
-    the balls, so that a large image needs no more memory than a small one. If a ball touches the plane of the camera,
-    nothing is known, and every pixel gets all distances.
+    The interval is never too narrow; near > far if a pixel sees no ball. Each ball is drawn as one block of pixels,
+    with its nearest and farthest distance; all are then widened by as many blocks as the largest ball covers. Blocks
+    grow with the balls, so that a large image needs no more memory than a small one. If a ball touches the camera
+    plane, nothing is known, and every pixel gets all distances.
     """
     rotation, position = camera_to_world[:3, :3], camera_to_world[:3, 3]
     x, y, z = (rotation.t() @ (centres - position[:, None])).unbind(0)

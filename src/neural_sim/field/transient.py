@@ -15,9 +15,9 @@ SMALLEST_BETA = 0.03  # as in NeRF in the Wild
 
 
 class TransientHead(nn.Module):
-    """Density, colour and uncertainty of what only one view shows, from a position and the view's transient code.
+    """Predicts density, colour and uncertainty of what only one view shows, from a position and the view's code.
 
-    It is used while fitting and dropped afterwards; ``codes`` are 16 numbers a view, as in NeRF in the Wild.
+    It is used while fitting and dropped afterwards; ``codes`` has 16 numbers per view, as in NeRF in the Wild.
     """
 
     def __init__(
@@ -57,8 +57,8 @@ def composite_both(
 ) -> tuple[Rendering, Float[Tensor, "rays"]]:
     """Composite object and transients together; return the image and each ray's beta, seen through both.
 
-    Densities add and colours mix by density, as for two media in one place that emit and absorb. (NeRF in the Wild adds
-    the alphas of the two, which together exceed 1 where both are opaque.)
+    Densities add up and colours mix by density, as for two media that emit and absorb in the same place. (NeRF in the
+    Wild adds the two alphas, whose sum exceeds 1 where both are opaque.)
     """
     sigma = static[0] + transient[0]
     fraction = (transient[0] / sigma.clamp_min(torch.finfo(sigma.dtype).tiny))[:, None]
@@ -77,8 +77,8 @@ def uncertain_error(
 ) -> Float[Tensor, ""]:
     """Return |C - C^|^2 / (2 beta^2) + log(beta^2) / 2, averaged over rays, plus a penalty on transients.
 
-    ``penalty`` multiplies the mean optical depth of the transients' samples (NeRF in the Wild, Sec. 4.2). The square
-    error is its expectation over backgrounds.
+    ``penalty`` multiplies the mean optical depth of the transients' samples (NeRF in the Wild, Sec. 4.2). The squared
+    error is the expected one over random backgrounds.
     """
     errors = expected_errors(rendering, pixels).sum(-1)
     return (0.5 * errors / beta.square() + beta.log()).mean() + penalty * depths.mean()
