@@ -1,4 +1,4 @@
-"""Photographs with unknown cameras: which files they are, and what their EXIF says about the camera."""
+"""Photographs with unknown cameras: their files, and what EXIF says about their cameras."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ UP = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (
 class Shot:
     """A photograph: its header, and the camera that took it.
 
-    ``focal`` is the focal length in pixels according to EXIF, None if it has none. Photographs of one ``camera`` share
-    their intrinsics.
+    ``focal`` is the focal length in pixels according to EXIF, or None. Photographs with the same ``camera`` share their
+    intrinsics.
     """
 
     image: Path

@@ -60,7 +60,7 @@ class BOP(MeshFiles):
         return items
 
     def _diameters(self) -> dict[str, float]:
-        """Read diameters in millimetres by object number from models_info.json; empty, with a warning, without it."""
+        """Read diameters in millimetres by object number from models_info.json; if it is missing, warn, return none."""
         if not self._info.is_file():
             log.warning("%s is missing: the models are taken to be in millimetres, unchecked", self._info)
             return {}
@@ -71,7 +71,7 @@ class BOP(MeshFiles):
             raise ValueError(f"{self._info}: want {{number: {{'diameter': mm}}}}: {error}") from error
 
     def _checked(self, item: ObjectMesh, path: Path, diameter: float | None) -> ObjectMesh:
-        """Convert the object to metres: the file's unit is the millimetre or, if the diameter says so, the metre."""
+        """Check an object against its diameter, and correct its scale if the file is in metres, not millimetres."""
         if diameter is None:
             return item
         measured = _diameter(item) / MILLIMETRE

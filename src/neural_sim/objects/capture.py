@@ -195,7 +195,7 @@ class Capture:
 
 
 def say_missing(source: Path, missing: Sequence[str], listed: int) -> None:
-    """Warn about listed photographs without a file, which are left out.
+    """Warn about listed photographs that have no file and are left out.
 
     Raises:
         ValueError: none of the ``listed`` photographs has a file.
@@ -215,7 +215,8 @@ def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
     """Check a camera-to-world matrix of 3 or 4 rows, and return it with 4.
 
     Raises:
-        ValueError: the matrix has another shape, entries that are not finite numbers, or is not a rotation.
+        ValueError: the matrix has another shape or entries that are not finite, or its first three rows and columns are
+            not a rotation.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)

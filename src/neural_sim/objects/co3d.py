@@ -37,13 +37,13 @@ class Co3d(Photos):
     Args:
         root: the folder that holds the categories' folders.
         names: categories; null: all.
-        sequences: category -> name of its sequence. null, or a category that it does not list: the sequence with the
+        sequences: category -> name of its sequence. For other categories, or with null, it is the sequence with the
             highest ``viewpoint_quality_score``, or the longest if none has a score.
         masks, up, size, box, scene, refinement, poor, mask_command, mask_value: see ``Photos``.
 
     Raises:
         ValueError: a folder is missing or has no categories, a name or sequence is unknown, or annotations cannot be
-            read or lack a key (the message has the file and the key); and whatever ``Photos`` refuses.
+            read or lack a key (the message has the file and the key); see ``Photos`` for the others.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Co3d(Photos):
 
     @cached_property
     def _scores(self) -> dict[str, dict[str, float]]:
-        """Read the quality scores of each category's sequences that have one."""
+        """The quality scores of each category's sequences, for those that have one."""
         found: dict[str, dict[str, float]] = {}
         for name, folder in self._folders.items():
             path = folder / SEQUENCES

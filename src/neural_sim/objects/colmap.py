@@ -100,7 +100,7 @@ def _model(folder: Path) -> tuple[Any, dict[int, Any]]:
         read = _reconstruction(folder)
         named = {
             number: image for number, image in read.images.items() if image.name is not None
-        }  # all decoded
+        }  # reading a name decodes it, and may raise
         return read, {number: image for number, image in named.items() if image.has_pose}
     except Exception as error:  # pycolmap raises whatever its C++ checks raise
         reason = " ".join(str(error).split())
@@ -136,12 +136,12 @@ def _check_counts(path: Path, kind: str) -> None:
     """Refuse a binary file whose counts point beyond its end, where pycolmap would read on for hours.
 
     Raises:
-        ValueError: the file is such a file.
+        ValueError: the file ends before its counts say.
     """
     data, at = path.read_bytes(), 0
 
     def take(size: int) -> int:
-        """Skip some bytes, and return the number that they encode."""
+        """Skip ``size`` bytes, and return the number that they encode."""
         nonlocal at
         at += size
         if at > len(data):

@@ -37,7 +37,7 @@ def file_digest(*paths: Path) -> str:
 
 
 def content_digest(files: Mapping[str, Path]) -> str:
-    """Return the SHA-256 of names and contents, whatever the files' folders; a missing file counts as empty."""
+    """Return the SHA-256 of names and contents, independent of the files' folders; missing files count as empty."""
     lines = (f"{name} {file_digest(path)}\n" for name, path in files.items())
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
@@ -108,10 +108,10 @@ _REFERENCES: dict[str, Callable[[Path], list[Path]]] = {
 def choose(
     available: dict[str, Path], names: Sequence[Any] | None, aliases: dict[str, str], where: str
 ) -> list[str]:
-    """Choose ``names``, which may be aliases, among the available ones, in their order; for None all of them, sorted.
+    """Return the available names that ``names`` chooses, in its order, with aliases resolved; for None all, sorted.
 
-    A value that the command line parsed as a number or a word of YAML (1, 1e3, 2024_05_01, true, null) stands for the
-    single name that is written so.
+    A value that the command line parsed as a number or YAML keyword (1, 1e3, 2024_05_01, true, null) stands for the
+    only name that can be read as this value.
 
     Raises:
         ValueError: a name is unknown, or an object is named twice.
@@ -134,7 +134,7 @@ def choose(
 
 
 def _written(value: Any, names: Sequence[str]) -> str:
-    """Return the only one of ``names`` that the command line would parse as this value, else the value as text."""
+    """Return the only name that the command line would parse as this value; without one, the value as text."""
     words = {None: ("null",), True: ("true",), False: ("false",)}
     if value is None or isinstance(value, bool):
         alike = [name for name in names if name.lower() in words[value]]

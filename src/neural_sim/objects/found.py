@@ -1,4 +1,4 @@
-"""Cameras that were found from photographs: how good they are, and why some or all are missing."""
+"""Judge the cameras that were found from photographs, and say why some or all are missing."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ class FoundCapture:
 
     Args:
         capture: the photographs that have a camera.
-        error: mean distance between features and their points' projections, in pixels of the reduced photographs.
+        error: mean reprojection error, in pixels of the reduced photographs.
         points: number of points from which the cameras were found.
         missing: names of the photographs without a camera.
-        apart: number of the missing photographs that fit together in another group.
+        apart: number of missing photographs that fit together, but not with the others.
         turning: whether the room stands still in the photographs while the object turns.
     """
 
@@ -90,7 +90,7 @@ class FoundCapture:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Write names in words; of many, only the first."""
+    """List names; if there are many, only the first ones."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 
@@ -142,7 +142,7 @@ def _why_not(verified: Mapping[tuple[int, int], tuple[str, int]], count: int, to
 
 
 def _extent(model: Any, capture: Capture) -> float:
-    """Return the largest distance of a camera from their centre, in units of the median distance of what they show."""
+    """Return the largest distance of a camera from the cameras' centre, relative to the median distance of points."""
     centres = np.stack([frame.camera_to_world[:3, 3] for frame in capture.frames])
     points = np.array([point.xyz for point in model.points3D.values()])
     away = np.median(np.linalg.norm(points - centres.mean(0), axis=1))
@@ -153,8 +153,8 @@ def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple
     """Return the direction that is up in most photographs, in the capture's frame.
 
     It is perpendicular to all pictures' horizontal axes, because people hold cameras level and tilt them down; if these
-    axes nearly coincide, it is the mean of the pictures' own up directions. A photograph that lies on its side, without
-    EXIF to say so, counts by whichever axis fits the others.
+    axes nearly coincide, it is the mean of the pictures' own up directions. For a photograph that lies on its
+    side and has no EXIF to say so, the axis that fits the others best counts as its up direction.
     """
     own = np.stack([pose[:3, :3] @ shot.up for pose, shot in zip(poses, shots, strict=True)])
     axes = np.concatenate([poses[:, :3, :2], -poses[:, :3, :2]], -1)  # right, up, left, down of each camera
@@ -177,8 +177,8 @@ def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple
 def in_own_frame(capture: Capture) -> Capture:
     """Return a capture in a meaningful frame, because COLMAP's is arbitrary.
 
-    +z is up, the origin is where the cameras look, and the cameras' median distance is 1. They are on the side of +x:
-    by their mean or, if they are all around, by the first.
+    +z is up, the origin is the point that the cameras look at, and their median distance from it is 1. The cameras'
+    mean direction, or that of the first camera if they are all around, is towards +x.
     """
     poses = np.stack([frame.camera_to_world for frame in capture.frames])
     up = np.array(capture.up if capture.up is not None else mean_up(capture))

@@ -38,7 +38,7 @@ class Accessors:
         return data[start:end]
 
     def stored(self, index: int) -> bool:
-        """Return whether the file itself has an accessor's numbers; otherwise there are zeros for a decoder to fill."""
+        """Return whether the file itself has an accessor's numbers; otherwise they are zeros for a decoder to fill."""
         return "bufferView" in self._accessors[index] or "sparse" in self._accessors[index]
 
     def floats(self, index: int, width: int) -> Float[np.ndarray, "n width"]:

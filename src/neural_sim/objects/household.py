@@ -1,4 +1,4 @@
-"""The six procedural household objects: how they look, and which of their sides look alike.
+"""The six procedural household objects, some of whose sides look alike.
 
 The pitcher's +x side is the can's label, except for the position of its bar; its -x side has the handle and another
 print. The drill's -x side is the tall box's front, except for the colours of two marks; its +x side has grip and chuck,
@@ -27,8 +27,8 @@ YELLOW: Colour = (244, 200, 36)
 VIOLET: Colour = (60, 30, 110)
 AMBER: Colour = (242, 172, 36)
 
-# Look-alike sides differ by the position of the label's bar and by the colours of the drill's marks. They were chosen
-# on seeds 100 and 101, so that a few images are too few to learn the difference and a few dozen are enough.
+# Look-alike sides differ in the position of the label's bar and in the colours of the drill's marks. These were chosen
+# on seeds 100 and 101 such that a few images are too few to learn the difference, but a few dozen are enough.
 CAN_EMBLEM = PITCHER_EMBLEM = RED
 CAN_BAND = PITCHER_BAND = WHITE
 BOX_EMBLEM, DRILL_EMBLEM = NAVY, VIOLET
@@ -191,7 +191,7 @@ def _box_prints(generator: torch.Generator) -> dict[str, Print]:
 
 
 def _chuck(depth: float, z: float, reach: float) -> list[Part]:
-    """Collar and chuck: a solid of revolution about the x axis at height ``z``."""
+    """Make collar and chuck, a solid of revolution about the x axis at height ``z``."""
     steel, collar = Print(32, 32, DARK_GREY), Print(32, 32, YELLOW)
     profile = [
         (0.0, 0.0),

@@ -1,4 +1,4 @@
-"""Masks from another program, which reads a folder of photographs and writes one mask for each into another folder."""
+"""Masks from another program, which reads a folder of photographs and writes their masks to another folder."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MaskCommand:
     """A command line that writes masks, such as ``rembg p -om {images} {masks}``.
 
     ``{images}`` stands for a folder of photographs, as PNG without EXIF, and ``{masks}`` for an empty folder. A mask
-    has its photograph's name, or a name that begins with it. No shell reads the line.
+    has its photograph's name, or a name that begins with it. The line is not run by a shell.
 
     Raises:
         ValueError: the line lacks one of the two folders, or the program is not installed.

@@ -46,7 +46,7 @@ class Source(Protocol):
 
 
 class MeshSource(Source, Protocol):
-    """A source of meshes. ``metric``: they are in metres; otherwise they have no unit of length."""
+    """A source of meshes; ``metric`` says whether they are in metres or have no unit of length."""
 
     metric: ClassVar[bool]
 

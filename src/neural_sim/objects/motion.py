@@ -107,7 +107,7 @@ class _Search:
     progress: bool
 
     def run(self, mask: MaskOf) -> FoundCapture:
-        """Search, and return what was found."""
+        """Run the search."""
         shots, album = self.album.shots, self.album
         with signals_kept():
             import pycolmap
@@ -132,7 +132,7 @@ class _Search:
         return self.place / "database.db"
 
     def _write(self, mask: MaskOf, standing: Mapping[Path, Bool[np.ndarray, "_ _"]] | None) -> bool:
-        """Write reduced photographs, and the regions that count if not all do; return whether there are any."""
+        """Write reduced photographs, and masks of the regions that count, if any; return whether there are masks."""
         region = self.settings.region
         (self.place / "images").mkdir()
         (self.place / "masks").mkdir()
@@ -169,22 +169,22 @@ class _Search:
         options.use_gpu, options.num_threads = False, _threads()
         options.max_image_size = self.settings.picture_size
         options.sift.max_num_features = self.settings.features
-        # Small photographs are also searched at twice their size: four times the work, but they have little else to
-        # find.
+        # Small photographs are also searched at twice their size: four times the work, but otherwise they have too few
+        # features.
         largest = max(max(self._reduced(shot)) for shot in self.album.shots)
         options.sift.first_octave = -1 if largest < LARGE else 0
         groups: dict[object, list[int]] = {}
         for number, shot in enumerate(self.album.shots):
             groups.setdefault(shot.camera, []).append(number)
         with self._open(pycolmap):
-            pass  # an empty file, which is wanted below
+            pass  # creates an empty database for the import
         for numbers in groups.values():
             reader, shot = pycolmap.ImageReaderOptions(), self.album.shots[numbers[0]]
             if shot.focal is not None:
                 width, height = self._reduced(shot)
                 focal = shot.focal * width / shot.size[0]
                 reader.camera_params = f"{focal},{0.5 * width},{0.5 * height},0"
-            # Photographs get their numbers here, in their order, because the threads of the extraction keep no order.
+            # The import assigns ids in order, which the threads of the extraction would not keep.
             pycolmap.import_images(
                 self.database, self.place / "images", pycolmap.CameraMode.SINGLE,
                 [_file(number) for number in numbers], reader,
@@ -213,7 +213,7 @@ class _Search:
         matching.use_gpu, matching.num_threads = False, _threads()
         verification.ransac.random_seed = SEED
         verification.compute_relative_pose = True
-        # What stands still in the pictures while the object turns is evidence of a camera that did not move.
+        # Matches in a room that stands still while the object turns would show a camera that did not move.
         verification.filter_stationary_matches = standing and self.settings.region == "auto"
         imported, listed = pycolmap.ImportedPairingOptions(), self.place / "pairs.txt"
         imported.match_list_path = str(listed)
@@ -228,11 +228,11 @@ class _Search:
     def _map(self, pycolmap: Any, standing: bool, bar: Any) -> list[Any]:
         """Return COLMAP's models, the largest first."""
         options = pycolmap.IncrementalPipelineOptions()
-        # One thread: sums from several threads are rounded by their order, and equal photographs must have equal
-        # cameras.
+        # One thread, because the rounding of sums depends on the order of threads, and equal photographs must have
+        # equal cameras.
         options.num_threads, options.random_seed, options.extract_colors = 1, SEED, False
         options.min_model_size, options.max_num_models = 3, 5
-        # A turning object fills a small part of the photographs, which says little about the lens.
+        # A turning object fills only a small part of the photographs, which says little about the lens.
         lens = not (standing and all(shot.focal for shot in self.album.shots))
         options.ba_refine_focal_length = options.ba_refine_extra_params = lens
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = lens

@@ -33,7 +33,7 @@ Wrap = Literal["repeat", "mirror", "clamp"]
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture in sRGB, and what it shows beyond its edges along u and v."""
+    """A picture in sRGB, and how it continues beyond its edges along u and v."""
 
     pixels: UInt8[np.ndarray, "h w 3"]
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
@@ -46,7 +46,7 @@ class Paint(Visuals):
         albedo: sRGB colour of each vertex, in [0, 1]; multiplies the texture.
         uv: texture coordinates of each vertex; v points up in the picture.
         page: texture of each vertex, -1: none. The vertices of a face have the same one.
-        textures: the textures.
+        textures: the textures that ``page`` counts, from 0.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Paint(Visuals):
 
     @property
     def defined(self) -> bool:
-        """Whether there are colours; trimesh asks for this."""
+        """Whether there are colours, which trimesh asks for."""
         return True
 
     @override

@@ -90,11 +90,11 @@ class Photos:
         names: objects to load; null: all.
         masks: source of the objects' masks, see ``Pictures``.
         up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; or a mapping
-            by object name; null: the one in the capture's file, else the mean of the cameras' up vectors.
+            by object name; null: the direction in the capture's file, or else the mean of the cameras' up vectors.
         size: diameter of the bounding sphere in metres, or a mapping by object name; null: unknown (unit: radii).
         box: with ``masks="scene"``: two corners of a box around the object, along the axes of the capture's frame and
-            in its unit, or a mapping by object name; null: the one in ``box.json`` in the capture's folder, else the
-            object is searched where the cameras look.
+            in its unit, or a mapping by object name; null: the box in ``box.json`` in the capture's folder, or else the
+            object is searched for where the cameras look.
         scene: computes masks if ``masks="scene"``.
         refinement: corrects the cameras' poses, if given.
         poor: what happens if a field does not show its object: nothing trains on it (``refuse``), or it is used
@@ -104,7 +104,7 @@ class Photos:
         mask_command: with ``masks="command"``: see ``MaskCommand``.
         mask_value: the object's value in masks that are images of labels, or a mapping by object name.
         beside: meshes that are additional objects of the run, with other names; null: none.
-        frames: number of frames to take from a video, if cameras are searched and a folder has a video but no
+        frames: number of frames to take from a video, if cameras must be found and a folder has a video but no
             photographs.
 
     Raises:
@@ -152,7 +152,7 @@ class Photos:
         self._check()
 
     def _check(self) -> None:
-        """Raise errors about files now, not in a later stage."""
+        """Refuse missing or unsuitable files now, not in a later stage."""
         if self.poses is None:
             for capture in self.captures.values():
                 if self.masks in ("auto", "files"):
@@ -167,7 +167,7 @@ class Photos:
                     refuse_shared(found, file, shot.image)
 
     def _found(self) -> dict[str, Path]:
-        """Find the captures' folders by object name: those below the root, else the root itself."""
+        """Find the captures' folders by object name: those below the root or, without any, the root itself."""
         usable = is_capture if self.poses is None else can_be_captured
         below = [
             p for p in sorted(self.root.iterdir()) if p.is_dir() and p.name not in (FOLDER, MASKS_FOLDER)
@@ -252,7 +252,7 @@ class Photos:
         return tuple(frame.image for frame in self.captures[name].frames)
 
     def command_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Return a mask for each of ``images`` if ``masks="command"``, else none."""
+        """Return a mask for each of ``images`` if ``masks="command"``; otherwise none."""
         return () if self.command is None else self.command.masks(self.images(name), self._value(name))
 
     def digests(self) -> dict[str, str]:
@@ -265,7 +265,7 @@ class Photos:
         return None if size is None else 0.5 * float(size)
 
     def box_of(self, name: str) -> Corners | None:
-        """Return the box that defines an object, if any: as set, else as saved in its capture's folder."""
+        """Return the box around an object, if any: the one that was set, or else the one in its capture's folder."""
         if self.masks != "scene":
             return None
         return box_of(self.box, name) or saved_box(self._folders[name])
@@ -277,7 +277,7 @@ class Photos:
     def split(self, name: str, count: int, held_out: int) -> tuple[list[Frame], list[Frame]]:
         """Return at most ``count`` training frames and ``held_out`` test frames, evenly spread.
 
-        Test frames are the capture's own if it has any, else at most an eighth of all frames.
+        Test frames are the capture's own if it has any; otherwise they are at most an eighth of all frames.
 
         Raises:
             ValueError: there are fewer than two training frames.
@@ -295,7 +295,7 @@ class Photos:
         return _spread(train, count), _spread(test, held_out)
 
     def computed_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Compute a mask for each frame of an object's capture if ``masks="scene"``, else none."""
+        """Compute a mask for each frame of an object's capture if ``masks="scene"``; otherwise none."""
         if self.scene is None or self.masks != "scene":
             return ()
         return self.scene.masks(self.captures[name], self._up(name), self.box_of(name))
@@ -318,7 +318,7 @@ class Photos:
     def views(
         self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
     ) -> PosedViews:
-        """Make views of an object, test frames last, and refine them: ``split``, ``resampling.resample``."""
+        """Resample an object's photographs as views, test frames last, and refine their poses."""
         train, test = self.split(name, count, held_out)
         pictures = pictures or self.pictures(name)
         views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)
@@ -330,7 +330,7 @@ class Photos:
         return views if self.refinement is None else self.refinement.refine(views, len(test))
 
     def up_of(self, name: str) -> tuple[float, float, float]:
-        """Return the up direction in a capture's frame: as set, else its file's, else the cameras' mean."""
+        """Return the up direction in a capture's frame: the one that was set, its file's, or the cameras' mean."""
         capture = self.captures[name]
         return self._up(name) or capture.up or mean_up(capture)
 
@@ -366,7 +366,7 @@ class Photos:
         return content_digest({options: Path(), **files})
 
     def found_digest(self, name: str) -> str:
-        """Digest what found cameras depend on: the photographs, their masks, and how these are read."""
+        """Digest what the search for cameras depends on: the photographs, their masks, and how these are read."""
         options = f"{self.masks} {self._value(name)} {self.command} "
         return content_digest({options: Path(), **self._pictures_and_masks(name)})
 
@@ -384,12 +384,12 @@ def _named(files: Iterable[Path], folder: Path) -> dict[str, Path]:
 
 
 def can_be_captured(folder: Path) -> bool:
-    """Return whether a folder, or its folder ``images``, holds pictures, or the folder holds a video."""
+    """Return whether a folder has a video, or pictures in it or in its subfolder ``images``."""
     return bool(pictures_of(folder) or videos_of(folder))
 
 
 def is_capture(folder: Path) -> bool:
-    """Whether a folder has a capture's camera files."""
+    """Return whether a folder has the camera files of a capture."""
     return has_transforms(folder) or bool(model_folders(folder))
 
 

@@ -66,7 +66,7 @@ def box_of(box: Box | Mapping[str, Box | None] | None, name: str) -> Corners | N
 
 
 def saved_box(folder: Path) -> Corners | None:
-    """Read the box that was saved next to a capture; None without one.
+    """Read the box that was saved next to a capture; None if there is none.
 
     Raises:
         ValueError: the file is not a box; the message has its path.
@@ -167,7 +167,7 @@ def check_masks(capture: Capture) -> None:
 
 
 def refuse_shared(found: dict[Path, Path], file: Path, image: Path) -> None:
-    """Note in ``found`` whose mask a file is. Raises ``ValueError`` if it already belongs to another photograph."""
+    """Record in ``found`` whose mask a file is; raise ``ValueError`` if it already belongs to another photograph."""
     other = found.setdefault(file, image)
     if other != image:
         raise ValueError(
@@ -183,7 +183,7 @@ def refuse_size(file: Path, size: Size, image: Path, wanted: Size) -> None:
 
 
 def mask_of(frame: Frame, source: Path) -> Path | None:
-    """Find the file of a frame's mask; None without one."""
+    """Find the file of a frame's mask; None if there is none."""
     return frame.mask or mask_beside(frame.image, source)
 
 

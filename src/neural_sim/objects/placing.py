@@ -38,7 +38,7 @@ SEEN_BY = 0.5
 
 @dataclass(frozen=True)
 class Placement:
-    """Where an object lies in its capture.
+    """An object's place in its capture.
 
     ``to_object`` maps the capture's frame to the object's: +z up, inside the unit sphere around the origin. ``radius``
     is that sphere's radius in the capture's unit.
@@ -57,7 +57,7 @@ class Placement:
 def place(pictures: Pictures, up: tuple[float, float, float] | None, box: Corners | None = None) -> Placement:
     """Place an object by the visual hull (Laurentini 1994) of its silhouettes, which gives centre and radius.
 
-    ``up`` is in the capture's frame; None: that of its file, else the mean of the cameras' up vectors, which is logged.
+    ``up`` is in the capture's frame; None: its file's, or else the mean of the cameras' up vectors, which is logged.
     ``box`` bounds the hull; its sides are along the axes of the capture's frame.
 
     Raises:
@@ -111,7 +111,7 @@ def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:
 
 
 def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
-    """Read the object's mask at reduced size; a pixel belongs to it if any of the photograph's pixels there does."""
+    """Read the object's mask at reduced size, where a pixel counts if any of the photograph's pixels in it does."""
     alpha = pictures.rgba(frame)[..., 3]
     step = max(1, max(alpha.shape) // SMALL)
     return functional.max_pool2d(alpha[None, None], step, ceil_mode=True)[0, 0] > 0.5
@@ -150,7 +150,7 @@ def sphere_of(
     shown = [(frame, mask) for frame, mask in zip(capture.frames, silhouettes, strict=True) if mask.any()]
     ends = torch.tensor([[-math.inf] * 3, [math.inf] * 3] if box is None else box, dtype=torch.float64)
     centre, half = _first_cube(shown) if box is None else _cube_of(box)
-    # First by whole cells, so that no thin part is missed; then in a cube that fits, by the cells' centres.
+    # First with whole cells, so that no thin part is missed; then with cell centres, in a cube that fits.
     for reach in (0.5 * np.sqrt(3.0), 0.0):
         cell = 2.0 * half / CELLS
         axis = torch.linspace(-half + 0.5 * cell, half - 0.5 * cell, CELLS, dtype=torch.float64)
@@ -177,7 +177,7 @@ def _cube_of(box: Corners) -> tuple[np.ndarray, float]:
 
 
 def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, float]:
-    """Find the cube around the point nearest to the rays through the silhouettes' centres: centre, half a side."""
+    """Return centre and half side of a cube around the point nearest to the rays through the silhouettes' centres."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     spans = []
     for frame, mask in shown:

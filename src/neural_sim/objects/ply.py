@@ -1,4 +1,4 @@
-"""PLY files: one texture or several, by vertex or corner, or the colours of vertices or faces."""
+"""Read PLY files, with one texture or several, by vertex or by corner, or with colours of vertices or faces."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def read_ply(path: Path) -> list[Part]:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Triangles of vertices; ``origin`` has each one's polygon and its three places in it."""
+    """Triangles; ``origin`` has, for each, the polygon it is cut from and the places of its corners in that polygon."""
 
     vertices: Float[np.ndarray, "v 3"]
     normals: Float[np.ndarray, "v 3"] | None
@@ -111,7 +111,7 @@ def _triangles(
 
 
 def _coordinates(vertex: Element, face: Element, model: _Model) -> Float[np.ndarray, "f 3 2"] | None:
-    """Return texture coordinates of each corner: those of its polygon, else those of its vertex."""
+    """Return texture coordinates of each corner: those of its polygon, or else those of its vertex."""
     if "texcoord" in face.columns:
         stated = face.columns["texcoord"]
         made = np.zeros((*model.corners.shape, 2))
@@ -158,7 +158,7 @@ def _stacked(element: Element | None, names: Sequence[str]) -> Float[np.ndarray,
 
 
 def _colours(element: Element) -> Float[np.ndarray, "n 3"] | None:
-    """Return colours in [0, 1] according to their type; 32-bit integers are bytes that were stored wider."""
+    """Return colours, scaled to [0, 1] by their type; 32-bit integers are taken to be bytes in a wider type."""
     for names in _COLOURS:
         values = _stacked(element, names)
         if values is None:

@@ -1,4 +1,4 @@
-"""The elements of a PLY file as stored: ASCII and binary, of any byte order, with lists of any lengths."""
+"""Read the elements of a PLY file as stored: ASCII or binary, in any byte order, with lists of any length."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_elements(path: Path) -> dict[str, Element]:
     """Read a PLY file's elements, by name.
 
     Raises:
-        ValueError: header or data are not those of a PLY file, or end too early.
+        ValueError: the header or the data are not those of a PLY file, or end too early.
     """
     data = path.read_bytes()
     head, found, body = data.partition(_END)

@@ -7,10 +7,10 @@ from jaxtyping import Float
 
 
 def clipped(corners: Float[np.ndarray, "n 3"]) -> list[tuple[int, int, int]]:
-    """Cut a plane polygon into triangles: a fan if it is convex, else ear by ear."""
+    """Cut a planar polygon into triangles: as a fan if it is convex, otherwise by ear clipping."""
     count = len(corners)
     following = np.roll(corners, -1, axis=0)
-    normal = np.cross(corners - corners[0], following - corners[0]).sum(0)  # twice the area's vector
+    normal = np.cross(corners - corners[0], following - corners[0]).sum(0)  # twice the area vector
     turns = np.cross(corners - np.roll(corners, 1, axis=0), following - corners) @ normal
     if not (turns < 0.0).any() or not np.isfinite(turns).all():
         return [(0, i, i + 1) for i in range(1, count - 1)]

@@ -26,9 +26,8 @@ class Procedural:
     """Six textured household objects, two blue and four red, without a unit of length.
 
     Args:
-        names: which of the objects; None: all.
-        seed: seed of their small print. Shapes and marks are fixed; an object does not depend on which others are
-            chosen.
+        names: names of the objects; None: all.
+        seed: seed of their small print. Shapes and marks are fixed, and no object depends on which others are chosen.
 
     Raises:
         ValueError: a name is unknown.

@@ -69,7 +69,7 @@ def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh
 
 
 def _warn_of_outlier(vertices: Float[np.ndarray, "v 3"], name: str, source: str) -> None:
-    """Warn about one vertex far from all others, as from a wrong digit in a file: it would shrink the rest."""
+    """Warn about a single vertex far from all others (from a wrong digit, say), which would shrink the object."""
     away = np.linalg.norm(vertices - np.median(vertices, axis=0), axis=1)
     farthest = int(away.argmax())
     others = away[(vertices != vertices[farthest]).any(axis=1)]

@@ -1,4 +1,4 @@
-"""What stands still in all photographs of an object: on a turntable, the room."""
+"""Find what stands still in all photographs of an object: for an object on a turntable, the room."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ AROUND = 5
 
 
 def standing_parts(shots: Sequence[Shot]) -> dict[Path, Bool[np.ndarray, "_ _"]] | None:
-    """Return what stands still in photographs of one size; None if almost nothing does.
+    """Find the parts that stand still in photographs of one size; None if almost nothing does.
 
     Contrasts with the surroundings are compared, because exposure hardly changes them.
     """
     if len({shot.size for shot in shots}) > 1:
-        return None  # a camera on a tripod is not turned
+        return None  # the camera was turned, so it was not on a tripod
     details = np.stack([_detail(shot) for shot in shots])
     usual = np.median(details, axis=0)
     textured = np.abs(usual) > TEXTURE

@@ -27,7 +27,7 @@ PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
 def has_transforms(folder: Path) -> bool:
-    """Whether a folder has ``transforms.json`` or ``transforms_train.json``."""
+    """Return whether a folder has ``transforms.json`` or ``transforms_train.json``."""
     return any((folder / name).is_file() for name in NAMES[:2])
 
 
@@ -104,7 +104,7 @@ def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> dict[str, Any]:
-    """Apply nerfstudio's lists of files: those in ``val`` and ``test`` score, those in no list are left out."""
+    """Apply nerfstudio's lists of files: ``val`` and ``test`` are test frames, files in no list are left out."""
     lists = {part: document[f"{part}_filenames"] for part in PARTS if f"{part}_filenames" in document}
     if not lists:
         return document
@@ -169,7 +169,7 @@ def _frame(
 
 
 def _image(path: Path) -> Path | None:
-    """Find the image's file, None without one; NeRF-synthetic omits the suffix."""
+    """Find the image's file, None if there is none; NeRF-synthetic omits the suffix."""
     candidates = (path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES))
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 

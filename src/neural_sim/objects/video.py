@@ -83,7 +83,7 @@ def _sharpest(video: Path, count: int) -> Iterator[tuple[int, Image.Image]]:
             frames = enumerate(container.decode(video=0))
             for _, part in groupby(frames, lambda numbered: numbered[0] * count // max(count, total)):
                 number, frame = max(part, key=lambda numbered: _sharpness(numbered[1]))
-                # Phones store what the sensor saw, and by how much a player should rotate it.
+                # Phones store pictures as the sensor sees them, and the angle by which a player should rotate them.
                 yield number, frame.to_image().rotate(frame.rotation, expand=True)
     except av.FFmpegError as error:
         raise ValueError(f"{video}: cannot be read as a video: {error.strerror}") from error

@@ -1,4 +1,4 @@
-"""OBJ files and their materials: Kd times map_Kd, each material on its own faces."""
+"""Read OBJ files and their materials: Kd times map_Kd, each material on its own faces."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Material:
 
 @dataclass
 class _Model:
-    """The lines of an OBJ file. ``faces`` are polygons, by material; ``lines`` are the numbers of their first lines."""
+    """The lines of an OBJ file, split into words; ``faces`` has polygons by material."""
 
     vertices: list[list[str]] = field(default_factory=list)
     coordinates: list[list[str]] = field(default_factory=list)
@@ -121,7 +121,7 @@ def _material(
     faces: int,
     coloured: bool,
 ) -> Material:
-    """Return the material with a name; log which one faces without a material get."""
+    """Return the material with this name; log which one is used for faces without a material."""
     if name in materials:
         return materials[name]
     if coloured:
@@ -230,7 +230,7 @@ def _leading_numbers(words: list[str]) -> list[float]:
 
 
 def _text(path: Path) -> str:
-    """Read a text with any line ends; if it is not UTF-8, it is Latin-1, which older writers used."""
+    """Read a text with any line endings, as UTF-8 or else as Latin-1, which older writers used."""
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
@@ -334,7 +334,7 @@ def _triangles(polygons: list[list[Corner]], vertices: Float[np.ndarray, "v 3"])
 
 
 def _uniform(corners: Int[np.ndarray, "f 3 3"]) -> Iterator[Int[np.ndarray, "some 3 3"]]:
-    """Split triangles into those with and without coordinates; normals count if all of those have them."""
+    """Split triangles into those with and without texture coordinates; a part has normals if all its triangles do."""
     mapped = np.all(corners[:, :, 1] >= 0, axis=1)
     for chosen in (mapped, ~mapped):
         if chosen.any():
