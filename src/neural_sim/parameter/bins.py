@@ -14,7 +14,8 @@ from torch import Tensor
 
 from neural_sim.parameter.distributions import project_simplex
 
-# softmax of the lowest logit that ``bounded`` allows, as a fraction of the floor; p there is within this of the floor.
+# Softmax of the lowest logit that ``bounded`` allows, as a fraction of the floor; p there exceeds the floor by at most
+# that fraction.
 LOWEST = 0.25
 # Logit of a bin from which nothing may be drawn, such as one that no photograph of the object shows. Its p is 0,
 # without a floor, and no step brings it back. It is far below what steps can reach, so that no low logit is mistaken
@@ -44,7 +45,7 @@ def is_closed(psi: Float[Tensor, "*n k"]) -> Bool[Tensor, "*n k"]:
 
 
 def closing(psi: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-    """Close bins, whatever their psi was; return psi itself if there are none."""
+    """Close bins, whatever their psi was; return psi itself if none is to be closed."""
     return torch.where(closed, torch.full_like(psi, CLOSED), psi) if bool(closed.any()) else psi
 
 
@@ -98,9 +99,9 @@ def nearest(
     least: Float[Tensor, "*n k"] | float = 0.0,
     closed: Bool[Tensor, "*n k"] | None = None,
 ) -> Float[Tensor, "*n k"]:
-    """Find the nearest probabilities (Euclidean) with none below its ``least``, which must sum to less than 1.
+    """Find the nearest probabilities (Euclidean) that are not below ``least``, whose sum must be less than 1.
 
-    Nor does any fall below the p of a logit that ``bounded`` has raised, taking the largest p as 1. Those of ``closed``
+    Nor are they below the p of a logit that ``bounded`` has raised, with the largest p taken as 1. Those of ``closed``
     bins are 0.
     """
     bins = values.shape[-1]
@@ -149,7 +150,7 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
     moves under the same noise.
 
     Raises:
-        ValueError: log p is not a number; no bin would ever have enough.
+        ValueError: log p is NaN, so that bins would never have enough draws.
     """
     count, k = gumbel.shape
     p = log_p.double().softmax(-1)
@@ -190,7 +191,7 @@ def centres(bins: int, low: float, high: float, like: Tensor) -> Float[Tensor, "
 
 
 def linear_mean(weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"]) -> Float[Tensor, "*n"]:
-    """Compute the paper's approximate bin centre, sum_i y_i B_i. On a circle it is wrong across the wrap."""
+    """Compute the paper's approximate bin centre, sum_i y_i B_i. On a circle, it is wrong where angles wrap around."""
     return weights @ bin_centres
 
 

@@ -1,4 +1,4 @@
-"""Which bins of p_psi the photographs of an object show."""
+"""Find the bins of p_psi that the photographs of an object show."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST = 0.5
 
 @dataclass(frozen=True)
 class Coverage:
-    """For each bin, the fraction of its poses whose direction is within an angle of a photograph's."""
+    """The fraction of each bin's poses whose direction is within ``within_deg`` of a photograph's."""
 
     fractions: tuple[float, ...]
     within_deg: float
@@ -45,7 +45,7 @@ def coverage(
     """Compute how far photographs cover a factor's bins; None if its bins are not directions.
 
     Args:
-        distribution: the distribution of poses; coordinates that the factor does not draw take all of their range.
+        distribution: the distribution of poses; coordinates that the factor does not draw cover their whole range.
         factor: name of the factor.
         directions: unit vectors from the object to the photographs' cameras, in the object's frame.
         within_deg: largest angle in degrees at which a photograph is near a pose.
@@ -61,7 +61,7 @@ def coverage(
     fractions: list[float] = []
     for number in range(own.bins):
         bins = {
-            # All bins of another angle together are its range, which ``second`` runs through.
+            # Together, the bins of another angle make up its range, which ``second`` runs through.
             f.name: torch.full((len(first),), number) if f is own else (second * f.bins).long()
             for f in distribution.binned
         }

@@ -1,4 +1,4 @@
-"""Distributions over bins: as configurations state them by name; projections onto them; distances between them."""
+"""Distributions over bins: named in the configuration, projections onto them, and distances between them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Factors of p_psi: what all of them share, and log p over equal bins of one scene parameter."""
+"""Factors of p_psi: the interface that all of them share, and log p over equal bins of one scene parameter."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Factor(Protocol):
         ...
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Compute log w, where a derivative by psi over w is the one by p up to a constant. 0 for lights."""
+        """Compute log w such that a derivative by psi, divided by w, is that by p up to a constant; 0 for lights."""
         ...
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -194,7 +194,7 @@ class BinnedFactor:
 
     @property
     def lights(self) -> int:
-        """0: this factor does not move the light."""
+        """0: this factor does not change the light."""
         return 0
 
     def probabilities(self, which: str, object_name: str) -> Float[Tensor, "k"]:
@@ -238,7 +238,7 @@ class BinnedFactor:
     ) -> Float[Tensor, "*n k"]:
         """Compute logits of the probabilities nearest to p + ``change``.
 
-        None is lower than ``project`` allows, nor lower than the fraction ``keep`` of its present value.
+        None is lower than ``project`` allows, or lower than the fraction ``keep`` of its present value.
         """
         p, closed = self.p_of(psi), binned.is_closed(psi)
         return binned.logits(binned.nearest(p + change, self.floor, keep * p, closed), self.floor, closed)

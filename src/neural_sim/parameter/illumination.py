@@ -121,15 +121,15 @@ class Illumination:
     def psi_of(
         self, p: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"] | None = None
     ) -> Float[Tensor, "*n k"]:
-        """Return ``p``, the weights: psi is these."""
+        """Return ``p``: psi consists of the weights themselves."""
         return p
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Return psi itself."""
+        """Return psi, which consists of the weights themselves."""
         return psi
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Return 0: psi are the weights themselves."""
+        """Return 0, because derivatives by psi are those by the weights."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:

@@ -1,4 +1,4 @@
-"""The pose parameter: bins of the angle around the poles, of the turn about the vertical, or of both."""
+"""The pose parameter: bins of the angle over the poles, of the turn about the vertical, or of both."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Range = Annotated[
 @validated
 @dataclass(frozen=True)
 class Pose:
-    """Which angles of the camera's pose are learned.
+    """The angles of the camera's pose that are learned, and their bins.
 
     Args:
         bins: k, the number of equal bins of the full circle.

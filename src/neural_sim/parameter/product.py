@@ -74,7 +74,7 @@ class SceneDistribution:
     ``ranges`` are those of coordinates that no factor draws; distances are in ``distance_unit``.
 
     Raises:
-        ValueError: there is no factor, or two of one name or of one coordinate.
+        ValueError: there is no factor, or two factors share a name or a coordinate.
     """
 
     factors: tuple[Factor, ...]
@@ -104,7 +104,7 @@ class SceneDistribution:
         )
 
     def radii(self, sizes: Mapping[str, float | None]) -> tuple[float, ...] | None:
-        """List the radii of ``sizes`` if distances are in metres, see ``radii_in_metres``; else None."""
+        """Return the radii of ``sizes`` if distances are in metres, see ``radii_in_metres``; otherwise None."""
         if self.distance_unit == "radii":
             return None
         nearest = next((f.low for f in self.binned if f.coordinate == "distance"), self.ranges["distance"][0])
@@ -117,7 +117,7 @@ class SceneDistribution:
 
     @property
     def lights(self) -> int:
-        """Number of anchor lights; 0 where the light is fixed."""
+        """Number of anchor lights; 0 if the light is fixed."""
         return sum(factor.lights for factor in self.factors)
 
     @property
@@ -152,7 +152,7 @@ class SceneDistribution:
         return dict(zip(self.names, parts, strict=True))
 
     def join(self, parts: Mapping[str, Float[Tensor, "*n _"]]) -> Float[Tensor, "*n K"]:
-        """Join what ``split`` has split."""
+        """Invert ``split``."""
         return torch.cat([parts[name] for name in self.names], -1)
 
     def psi(self, which: str, objects: Sequence[str]) -> Float[Tensor, "objects K"]:
@@ -310,7 +310,7 @@ class SceneDistribution:
         """Compute log p of the drawn bins and explored lights (for REINFORCE).
 
         Raises:
-            ValueError: a light was not explored, and so has no density.
+            ValueError: a light was not explored, so it has no density.
         """
         parts = self.split(psi)
         logs = [f.log_probabilities(parts[f.name])[draw.bins[:, i]] for i, f in enumerate(self.binned)]
@@ -332,7 +332,7 @@ class SceneDistribution:
         return statistics
 
     def bins_of(self, draw: SceneDraw) -> Int[Tensor, "n factors"]:
-        """Find the bins of each draw's coordinates, see ``BinnedFactor.stratum_of``; a column a binned factor."""
+        """Find the bins of each draw's coordinates, see ``BinnedFactor.stratum_of``; one column per binned factor."""
         return _columns([f.stratum_of(draw) for f in self.binned], draw.phi)
 
     def _draw(
@@ -361,7 +361,7 @@ class SceneDistribution:
 class RelaxedDraws:
     """Draws that depend smoothly on psi, for the pathwise estimator.
 
-    ``tangents``: also render the maps' derivatives by those numbers of the draw that depend on psi.
+    ``tangents``: also render the derivatives of maps by the coordinates of a draw that depend on psi.
     """
 
     tangents: bool = False

@@ -21,7 +21,7 @@ class Unlearned:
     """Uniform ranges of coordinates that no parameter draws: angles in degrees, the distance in ``distance_unit``.
 
     Raises:
-        ValueError: a range that is not ordered, a distance within the object, an unknown unit.
+        ValueError: a range is not ordered, a distance is within the object, or the unit is unknown.
     """
 
     phi_deg: Annotated[tuple[float, float], Ascending()] = (0.0, 360.0)
@@ -41,7 +41,7 @@ class Unlearned:
 
 
 def radii_in_metres(nearest: float, sizes: Mapping[str, float | None]) -> tuple[float, ...]:
-    """List the radii in metres of ``sizes``, by object, and check that cameras ``nearest`` metres away are outside.
+    """Return the radii in metres of the objects ``sizes``, and check that cameras ``nearest`` metres away are outside.
 
     Raises:
         ValueError: an object has an unknown size, or the nearest camera would be inside it.

@@ -41,7 +41,7 @@ class UpdateState:
 
     @staticmethod
     def zeros(psi: Float[Tensor, "objects k"]) -> UpdateState:
-        """Begin before the first step."""
+        """Return the state before the first step."""
         return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi), torch.zeros_like(psi))
 
 
