@@ -36,9 +36,9 @@ class MeshRenderer(ABC):
         camera_to_world: Float[Tensor, "n 4 4"],
         lighting: Lighting | None = None,
     ) -> Float[Tensor, "n h w 4"]:
-        """Render RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is.
+        """Render RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is 0.
 
-        ``lighting`` lights these views; None: the renderer's own.
+        ``lighting`` applies to these views; None: the renderer's own.
         """
         size = (camera.width * self.supersample, camera.height * self.supersample)
         drawn = self._draw(
@@ -64,7 +64,7 @@ def straight_alpha(
     """Average ``factor`` x ``factor`` premultiplied RGBA samples, then divide colour by alpha (0 where alpha is 0).
 
     Straight colours must not be averaged directly: the colours of empty samples would count. This uses NumPy because
-    torch's threads wait for those of OpenGL's software rasteriser and lose 20 ms an image.
+    torch's threads wait for those of OpenGL's software rasteriser and lose 20 ms per image.
     """
     if factor > 1:
         height, width = premultiplied.shape[0] // factor, premultiplied.shape[1] // factor

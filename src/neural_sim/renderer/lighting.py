@@ -1,4 +1,4 @@
-"""Directional lights fixed in the object's frame, Lambert's law under them, and the colour of a temperature."""
+"""Directional lights fixed in the object's frame, shading by Lambert's law, and the colours of temperatures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes through OpenGL: pyrender offscreen. Importing this module imports pyrender; use ``views`` to choose it."""
+"""Render meshes offscreen by OpenGL with pyrender, which this module imports; ``views`` chooses the renderer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neural_sim.types import PinholeCamera
 
 with contextlib.suppress(ImportError):
     # Mesa's software rasteriser loads LLVM, and triton (which torch's optimisers import) has its own. If triton is
-    # loaded second, it crashes the process; if it is loaded first, both work. Without triton there is no such trouble.
+    # loaded second, it crashes the process; if it is loaded first, both work.
     import triton  # noqa: F401
 
 # Nothing closer to the camera than this is drawn; objects have radius 1, and cameras stay outside them.
@@ -92,7 +92,7 @@ def _material(texture: Texture | None) -> pyrender.MetallicRoughnessMaterial:
     )
 
 
-# One context a process: freeing one of two EGL contexts closes the display that they share, and the other with it.
+# One context per process: freeing one of two EGL contexts closes the display that they share, and so the other one.
 _context: pyrender.OffscreenRenderer | None = None
 
 

@@ -1,4 +1,4 @@
-"""Images of a radiance field, and their derivatives with respect to the rays."""
+"""Render images of a radiance field, and their derivatives with respect to the rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images of a field with appearance codes, and their derivatives by camera and light."""
+"""Render images of a field with appearance codes, and their derivatives by camera and light."""
 
 from __future__ import annotations
 
@@ -82,9 +82,9 @@ class NerfWRenderer(NerfRenderer):
         weights: Float[Tensor, "views k"] | None = None,
         weight_rates: Float[Tensor, "q views k"] | None = None,
     ) -> tuple[Maps, list[Maps]]:
-        """Render like ``render``, with m derivatives for cameras that move at ``rates``, then q for weights that do.
+        """Render like ``render``, with m derivatives for moving cameras, then q for changing weights.
 
-        m or q may be 0. The derivatives of opacity by weights are exactly 0.
+        The rates are ``rates`` and ``weight_rates``; m or q may be 0. Derivatives of opacity by weights are exactly 0.
         """
         field, weights = _checked(field, weights, len(camera_to_world))
         if weight_rates is None:

@@ -1,4 +1,4 @@
-"""Camera poses of photographs, corrected until the photographs agree on one field of the object.
+"""Correct the camera poses of photographs until the photographs agree on one field of the object.
 
 Each round fits a small field at the present poses and moves each camera by Gauss-Newton steps towards agreement of its
 photograph with that field: image alignment as in Lucas and Kanade (1981), against a radiance field. BARF (Lin et al.
@@ -46,7 +46,7 @@ VIEWS_AT_ONCE = 16
 class PoseRefinement:
     """Corrects poses in rounds, each with a small field and steps of each camera.
 
-    Coarse fields find cameras that are far off, but also move correct ones; the fields of the last third of the rounds
+    Coarse fields correct cameras that are far off, but also shift correct ones; in the last third of the rounds, fields
     have twice the resolution and steps, and move those back.
 
     Args:
@@ -55,7 +55,7 @@ class PoseRefinement:
         image_size: longer side in pixels to which larger views are reduced.
         resolution: cells along the unit sphere's diameter in the fields of the first rounds.
         steps: optimiser steps for each of these fields.
-        batch_rays: rays in a step.
+        batch_rays: number of rays in a step.
         seed: seed of the order of rays; separate from the run's seed, so that runs share views.
     """
 
@@ -134,8 +134,8 @@ def align(
 ) -> tuple[Float[Tensor, "views 4 4"], float]:
     """Return the poses after ``updates`` Gauss-Newton steps on Fair's loss of renders against views, and its mean.
 
-    Of the poses that a camera passes, including the given one, the one with the least loss is returned: a step that
-    overshoots is not kept.
+    Each camera gets the pose with the smallest loss among those it passed through, including the given one, so that a
+    step that overshoots is not kept.
     """
     renderer = renderer or NerfRenderer("draft")
     parts = torch.arange(len(views)).split(VIEWS_AT_ONCE)
@@ -187,7 +187,7 @@ def fair_loss(residual: Tensor) -> Tensor:
 
 
 def _residuals(values: Maps, views: PosedViews) -> Float[Tensor, "views n"]:
-    """Return what the views show minus the render, premultiplied."""
+    """Return the views minus their renders, premultiplied."""
     alpha = views.images[..., 3:]
     shown = Maps(views.images[..., :3] * alpha, alpha[..., 0])
     return _shown(_flat(shown) - _flat(values), views)

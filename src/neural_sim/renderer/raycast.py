@@ -1,4 +1,4 @@
-"""Meshes by ray casting on the CPU (trimesh over embree), for machines without OpenGL."""
+"""Render meshes by ray casting on the CPU (trimesh over embree), for machines without OpenGL."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EDGE_SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.37
 
 
 class RaycastRenderer(MeshRenderer):
-    """The same image as ``PyrenderRenderer`` without OpenGL: rays over embree, textures filtered by footprint."""
+    """Renders the same image as ``PyrenderRenderer`` without OpenGL: rays by embree, textures filtered by footprint."""
 
     name = "raycast"
 
@@ -72,7 +72,7 @@ def _trace(
 
 
 def _silhouette(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Find pixels with both hit and empty ones among themselves and their eight neighbours."""
+    """Find the pixels whose 3 x 3 neighbourhood has both hit and empty pixels."""
     padded = np.pad(mask, 1, mode="edge")
     height, width = mask.shape
     near = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
@@ -151,7 +151,7 @@ class Pyramid:
             self._levels.append(np.asarray(image))
 
     def sample(self, uv: Float[np.ndarray, "n 2"], level: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
-        """Sample colours in [0, 1]; ``uv`` has v upwards; ``level``: log2 of texels a sample (0 or less: full size)."""
+        """Sample colours in [0, 1]; ``uv`` has v upwards; ``level``: log2 of texels per sample (<= 0: full size)."""
         level = np.clip(level, 0.0, len(self._levels) - 1.0)
         low = np.floor(level).astype(np.int64)
         part = (level - low)[:, None]

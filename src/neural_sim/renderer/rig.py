@@ -32,8 +32,8 @@ GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 class LightRig:
     """k anchor lights around an object, and mixtures of them: shade = ambient + sum_i w_i light_i.
 
-    Directions lie on a spherical Fibonacci lattice. Temperatures are even in mired over ``temperature_range`` (kelvin)
-    and intensities even over ``intensity_range``, each in another order, so that neither correlates with the direction.
+    Directions lie on a spherical Fibonacci lattice. Temperatures are evenly spaced in mired over ``temperature_range``
+    (kelvin), intensities over ``intensity_range``, both in shuffled orders, so that neither correlates with direction.
     ``fill`` is the fraction of each light that comes from all sides. White surfaces stay within [0, 1] if ``ambient``
     and the largest intensity add up to at most 1 and the weights lie on a simplex.
     """
@@ -69,7 +69,7 @@ class LightRig:
         return Light(direction, dim + bright * (full - dim), temperature_colour(kelvin), self.fill)
 
     def lighting(self, weights: Sequence[float] | Float[Tensor, "k"]) -> Lighting:
-        """Return the mix of the anchors at these weights, which may have either sign.
+        """Return the mixture of the anchors with these weights, which may have either sign.
 
         Raises:
             ValueError: the number of weights is not that of the anchors.
@@ -117,6 +117,6 @@ class VariedLight:
 
 
 def _spread(count: int, ratio: float) -> list[float]:
-    """Return ``count`` even places from 0 to 1, in the order of the fractions of multiples of an irrational ratio."""
+    """Return ``count`` evenly spaced numbers in [0, 1], ordered as the fractional parts of multiples of ``ratio``."""
     order = sorted(range(count), key=lambda i: (i * ratio) % 1.0)
     return [order.index(i) / (count - 1) for i in range(count)]

@@ -1,4 +1,4 @@
-"""Surfaces for both mesh renderers: triangles, their albedo, and the light on both of their sides."""
+"""Surfaces for both mesh renderers: triangles with their albedo and the light on either side."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Surface:
 
 
 def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
-    """Read geometry, colours and texture from a trimesh, whichever of its visual kinds holds them.
+    """Read geometry, colours and texture from a trimesh with any kind of visual.
 
     Raises ``ValueError`` for a mesh without faces, or with vertices or normals that are not finite
-    (``neural_sim.objects.mesh.repair`` repairs those).
+    (``neural_sim.objects.repair`` repairs those).
     """
     if len(mesh.faces) == 0:
         raise ValueError("renderer: the mesh has no faces")
@@ -70,7 +70,7 @@ def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
 
 
 def _textured(visual: TextureVisuals, count: int) -> tuple[np.ndarray, Texture | None]:
-    """Return albedo and texture; a material without an image has only its one colour."""
+    """Return albedo and texture; a material without an image has a single colour."""
     material = visual.material
     image, factor = getattr(material, "image", None), np.ones(3)
     if isinstance(material, PBRMaterial):

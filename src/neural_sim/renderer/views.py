@@ -1,4 +1,4 @@
-"""Posed views of an object, drawn by a mesh renderer that works on this machine."""
+"""Render posed views of an object, with a mesh renderer that works on this machine."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Backend = Literal["auto", "pyrender", "raycast"]
 """Backend that draws meshes. auto: pyrender over EGL, else over OSMesa, else ray casting, with a line in the log."""
 
 PROBE_SECONDS = 60
-# Draws one triangle: a context may be created and still fail at its first shader.
+# It draws a triangle, because a context that was created may still fail at its first shader.
 PROBE = """
 import numpy, pyrender
 scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
