@@ -99,12 +99,12 @@ class Photographs(Target):
     Args:
         val_fraction: fraction of the photographs in the validation set, on which psi is learned, as near as whole
             groups allow; the rest is scored. Has no effect if the data set has its own parts.
-        train_fraction: fraction, of the photographs that are not scored, for training (``training.real``), also in
-            whole groups; the others are for validation. None: all are for validation.
-        split_by: what belongs together and must lie in one part, such as frames of one video, see
-            ``neural_sim.target.split.groups_of``; None: what the data set says, or else every photograph is its own
+        train_fraction: fraction of the unscored photographs that is for training (``training.real``), also in whole
+            groups; the others are for validation. None: all are for validation.
+        split_by: which photographs form a group that must stay in one part, such as frames of one video, see
+            ``neural_sim.target.split.groups_of``; None: the data set's own groups, or else every photograph is its own
             group, with a warning about near-duplicates in two parts.
-        limit: largest number of photographs; subclasses say of what, and which are taken; None: all.
+        limit: largest number of photographs, counted and chosen as the subclass says; None: all.
         unmatched: what to do with a class of the data set that is not an object: ``refuse`` the data set, or
             ``leave_out`` the class.
         minimum_side: boxes with a side shorter than this many pixels of the run's images are dropped and counted.
@@ -145,8 +145,7 @@ class Photographs(Target):
 class AnnotatedPhotographs(Photographs):
     """Photographs with labels of their own, divided by groups and by their pixels: equal ones lie in one part.
 
-    A subclass says what there is to read: ``source``, ``files`` and ``photographs``. For the arguments see
-    ``Photographs``.
+    A subclass defines ``source``, ``files`` and ``photographs``. For the arguments see ``Photographs``.
     """
 
     @property
@@ -162,8 +161,8 @@ class AnnotatedPhotographs(Photographs):
 
         Args:
             objects: the run's objects in the order of their labels.
-            distribution: the scene parameters; bins must be bins of its first factor that has any. None: they may be
-                any.
+            distribution: the scene parameters; pose bins must be bins of its first factor with bins. None: any bins are
+                allowed.
 
         Raises:
             ValueError: labels cannot be used, or classes are not objects.

@@ -1,4 +1,4 @@
-"""Choice of photographs such that each object is seen in pose bins as often as a distribution says."""
+"""Choose photographs such that the pose bins of each object follow a given distribution."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _bins(images: LabelledImages, row: int) -> list[int]:
 
 
 def most(p: Sequence[float], available: Sequence[int], generator: torch.Generator) -> list[int] | None:
-    """Return the largest available ``apportioned`` choice of photographs; None if there is none."""
+    """Return the counts of the largest ``apportioned`` choice that is available; None if there is none."""
     for total in range(sum(available), 0, -1):
         counts = apportioned(p, total, available, generator)
         if counts is not None:
@@ -86,7 +86,7 @@ def apportioned(
 ) -> list[int] | None:
     """Split ``total`` photographs among bins by largest remainders, each ``total * p`` rounded up or down.
 
-    Of bins with equal remainders, those with enough photographs are rounded up, at random.
+    Among bins with equal remainders, those with enough photographs are rounded up first, in random order.
 
     Returns:
         The number in each bin; None if a bin has too few photographs.

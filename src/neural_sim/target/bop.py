@@ -50,7 +50,7 @@ class BopTarget(PosedTarget):
         val: folder of the validation scenes, with one in ``every`` photographs of each, such as ``train_real``; None:
             scenes of ``test``.
         test: folder of the scenes that are scored: the images in ``test_targets_bop19.json`` if it is present and the
-            folder is ``test``, else one in ``every`` photographs of each scene.
+            folder is ``test``, otherwise one in ``every`` photographs of each scene.
 
     See ``PosedTarget`` for the other arguments.
     """
@@ -97,8 +97,8 @@ def _targets(path: Path) -> list[FrameName]:
 class BopScenes(FrameReader):
     """The files of a BOP data set.
 
-    An object's centre is that of its box in ``models/models_info.json``, or the origin of its poses without one; its
-    visibility is ``visib_fract``.
+    An object's centre is the centre of its box in ``models/models_info.json`` or, without that file, the origin of its
+    poses; its visibility is ``visib_fract``.
     """
 
     root: Path
@@ -232,7 +232,7 @@ class BopScenes(FrameReader):
         return self._file(name, IMAGES)
 
     def _file(self, name: FrameName, forms: Sequence[str]) -> Path:
-        """Return the first of a photograph's possible files that exists, else the first."""
+        """Return the first of a photograph's possible files that exists; if none does, the first."""
         files = [self._folder(name) / form.replace("*", f"{name.number:06d}") for form in forms]
         return next((file for file in files if file.is_file()), files[0])
 

@@ -43,8 +43,8 @@ class GivenCamera(CameraSource):
             image's centre, (width - 1) / 2 and (height - 1) / 2.
 
     Raises:
-        ValueError: only one of width and height is given; a focal length and a field of view; ``fy``, ``cx`` or ``cy``
-            without ``fx``; or a number out of its range.
+        ValueError: only one of width and height is given; both a focal length and a field of view are given; ``fy``,
+            ``cx`` or ``cy`` is given without ``fx``; or a number is out of its range.
     """
 
     width: PositiveInt | None = None

@@ -1,4 +1,4 @@
-"""The classes of a data set, and which objects of the run they are."""
+"""The classes of a data set, and their mapping to objects of the run."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class ClassMap:
     """Maps the classes of a data set to objects.
 
     Args:
-        mapping: class -> object, None to leave a class out. Classes not listed have the names of their objects; None:
-            none is listed.
+        mapping: class -> object, None to leave a class out. Classes not listed have the names of their objects. None
+            lists no class.
         source: the data set, for messages.
         key: the setting that holds the mapping, for messages.
-        kind: what the data set calls a class, and several classes, for messages.
+        kind: the data set's words for a class and for several classes, for messages.
         unmatched: what to do with a class that is not an object: ``refuse`` the data set, or ``leave_out`` the class;
             None: refuse, and there is no setting to choose otherwise.
     """

@@ -50,7 +50,7 @@ class CocoTarget(AnnotatedPhotographs):
         bin_attribute: attribute of the file's annotations, or else of their image, with the pose bin, counted from 1
             like ``dominant`` of a distribution; dots lead into nested entries (``attributes.pose``). Boxes without it
             have no bin. None: no box has one.
-        match_bins: in all parts take only photographs such that each object's bins follow the ``target`` of the first
+        match_bins: in every part, choose photographs such that each object's bins follow the ``target`` of the first
             parameter with bins, see ``neural_sim.target.bin_matching.matching``. Needs photographs of a single object
             each.
 
@@ -116,7 +116,7 @@ class CocoTarget(AnnotatedPhotographs):
 
     @cached_property
     def _bins(self) -> list[int] | None:
-        """The pose bin of each annotation, from 0, -1 without one."""
+        """The pose bin of each annotation, counted from 0; -1 if it has none."""
         return None if self.bin_attribute is None else self._coco.bins(self.bin_attribute)
 
     @override
@@ -136,8 +136,8 @@ class CocoTarget(AnnotatedPhotographs):
     def _path(self, entry: Entry) -> Path:
         """Return an image's file: by its name as written, with ``/``, or in Unicode's other form.
 
-        If none exists, such as when the name has other folders or is an address, it is the file with the last part of
-        the name, unless another image has that.
+        If there is no such file (the name may have other folders, or be a URL), it is the file with the last part of
+        the name, unless another image has the same last part.
 
         Raises:
             ValueError: the name leads out of the folder.

@@ -1,4 +1,4 @@
-"""COCO's annotation files, read and checked as a whole, for targets and for pictures on which a detector is tried."""
+"""Read and check COCO annotation files, for targets and for pictures on which a detector is tried."""
 
 from __future__ import annotations
 
@@ -85,12 +85,12 @@ def name_of(entry: Entry) -> str:
 
 
 def has_size(item: Entry) -> bool:
-    """Whether an annotation's box has a width and a height."""
+    """Tell whether an annotation's box has a width and a height."""
     return item["bbox"][2] > 0 and item["bbox"][3] > 0
 
 
 def is_crowd(item: Entry) -> bool:
-    """Whether an annotation is of several objects at once, whose box is not an object's."""
+    """Tell whether an annotation marks several objects at once, so that its box is not that of an object."""
     return bool(item.get("iscrowd", 0))
 
 
@@ -137,8 +137,8 @@ class CocoFile:
         and rotated boxes, which are replaced by the upright boxes around them.
 
         Raises:
-            ValueError: not JSON; a section or a key is missing; an id, a name or a box is invalid; an id or a file
-                belongs to several images; or there are annotations but no image of theirs is listed.
+            ValueError: the file is not JSON; a section or a key is missing; an id, a name or a box is invalid; an id or
+                a file belongs to several images; or there are annotations, but none of a listed image.
         """
         document = read_sections(path, tuple(REQUIRED))
         for section, keys in REQUIRED.items():
@@ -244,7 +244,7 @@ class CocoFile:
                 )
 
     def _check_orphans(self) -> None:
-        """Count annotations of images that are not listed in the log, or raise ``ValueError`` if all are."""
+        """Warn about annotations whose images are not listed; raise ``ValueError`` if no image of any is."""
         ids = {entry["id"] for entry in self.images}
         strange = [number for number, item in enumerate(self.annotations) if item["image_id"] not in ids]
         if not strange:
@@ -303,7 +303,7 @@ class CocoFile:
 
     @cached_property
     def usable(self) -> list[int]:
-        """Indices of annotations that are boxes of one thing, each once, without crowds and empty boxes."""
+        """Indices of the annotations of single objects, without crowds, empty boxes and repetitions."""
         return [
             row for row, item in enumerate(self.annotations)
             if has_size(item) and not is_crowd(item) and row not in self._repeated
@@ -331,7 +331,7 @@ class CocoFile:
         return boxes
 
     def bins(self, attribute: str) -> list[int]:
-        """Return the pose bin of each annotation, from 0, where the file counts from 1; -1 if it is unknown.
+        """Return the pose bin of each annotation, counted from 0 (the file counts from 1); -1 if it is unknown.
 
         Args:
             attribute: attribute of the annotation, or else of its image; dots lead into nested entries.

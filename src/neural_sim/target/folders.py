@@ -1,4 +1,4 @@
-"""Photographs in one folder for each class, as in ImageNet and ObjectNet: the target set of a classifier."""
+"""The target set of a classifier: photographs in one folder for each class, as in ImageNet and ObjectNet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs with known object poses, the reader of a data set, and what readers share."""
+"""Photographs with known object poses, the interface of a data set's reader, and helpers that readers share."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class FrameName(NamedTuple):
 
 @dataclass(frozen=True)
 class Listed:
-    """Photographs for validation and photographs that are scored; ``test`` None: scenes of ``val`` are set aside."""
+    """Photographs for validation and for scoring; with ``test`` None, scenes of ``val`` are set aside for scoring."""
 
     val: Sequence[FrameName]
     test: Sequence[FrameName] | None
@@ -40,8 +40,8 @@ class PosedObject:
 
     Args:
         name: its class in the data set.
-        object_to_camera: rigid, OpenCV axes (x right, y down, view along +z), metres; from the frame of the data
-            set's own model of the object.
+        object_to_camera: rigid transform in metres from the frame of the data set's own model of the object to the
+            camera's OpenCV axes (x right, y down, view along +z).
         box: (x0, y0, x1, y1) around the visible part, along pixel edges, where the image spans [0, width] x
             [0, height]; None: nothing is visible.
         visibility: the fraction of the object that is visible, in [0, 1], see the reader.
@@ -154,7 +154,7 @@ def numbers(values: Any, count: int, where: str) -> Float[np.ndarray, "count"]:
     """Return ``count`` finite numbers.
 
     Raises:
-        ValueError: anything else; the message has ``where``.
+        ValueError: the values are not ``count`` finite numbers; the message has ``where``.
     """
     try:
         made = np.asarray(values, dtype=np.float64).reshape(-1)

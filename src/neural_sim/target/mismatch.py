@@ -1,4 +1,4 @@
-"""How synthesised images differ from a target's in size, position, number, light and sharpness, and what would help."""
+"""Compare synthesised images with a target's: size, position, number, light and sharpness; propose settings."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ _BLURS = 25
 class Mismatch:
     """One statistic of the target's images and of the synthesised images, as medians.
 
-    ``larger`` is the probability that a random target image (or box) has a larger value than a random synthesised one,
-    0.5 without a difference (the Mann-Whitney statistic over its largest value); ``p_value`` tests for equality.
+    ``larger`` is the probability that a random target image (or box) has a larger value than a random synthesised one
+    (the Mann-Whitney statistic over its largest value); it is 0.5 if they do not differ. ``p_value`` tests for
+    equality.
     """
 
     name: str
@@ -102,7 +103,7 @@ def noise(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
 
 
 def sharpness(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
-    """Compute the mean gradient between neighbours over the steepest hundredth of pixels, which are edges."""
+    """Compute the mean gradient between neighbouring pixels over the steepest hundredth, which are edges."""
     steps = torch.stack([luma[:, 1:, :-1] - luma[:, :-1, :-1], luma[:, :-1, 1:] - luma[:, :-1, :-1]]).norm(
         dim=0
     )

@@ -30,7 +30,7 @@ _KINDS = {
 
 
 def missing_file(path: Path) -> str:
-    """Say that a path is not a file; if it is a folder, which files in it may be meant."""
+    """Explain that a path is not a file; for a folder, name the files in it that may be meant."""
     if not path.is_dir():
         return f"no such file: {path}"
     found = sorted(file.relative_to(path).as_posix() for file in path.glob("**/*.json"))
@@ -63,7 +63,7 @@ def read_sections(path: Path, sections: Sequence[str]) -> Mapping[str, Any]:
 
 
 def _kind_of(document: object) -> str:
-    """Say which program's own format a document is in; empty if it is unknown."""
+    """Return the name of a document's format; empty if it is unknown."""
     first = document[0] if isinstance(document, list) and document else document
     if not isinstance(first, dict):
         return ""

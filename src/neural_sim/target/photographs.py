@@ -1,4 +1,4 @@
-"""Photographs from files to tensors: which files there are, and their pixels and boxes, letterboxed."""
+"""Read photographs from files to tensors: find the files, and letterbox their pixels and boxes."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Letterbox:
         return image[:, self.top : self.top + self.inner_height, self.left : self.left + self.inner_width]
 
     def _sides(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return width and height, twice, of the photograph and of its part of the new image, and the part's origin."""
+        """Return the sizes of the photograph and of its part in the new image, and the part's origin, for boxes."""
         size = like.new_tensor([self.width, self.height, self.width, self.height])
         inner = like.new_tensor([self.inner_width, self.inner_height] * 2)
         return size, inner, like.new_tensor([self.left, self.top] * 2)
@@ -140,10 +140,10 @@ class Photograph:
         labels: the class of each box, a position in the run's objects.
         boxes: (x0, y0, x1, y1) in the upright picture's pixels, along their edges; None: one box,
             which is the whole photograph.
-        bins: the pose bin of each box, from 0, -1 if it is unknown; None: no box has one.
+        bins: the pose bin of each box, counted from 0; -1 if it is unknown; None: no box has one.
         name: its name in messages.
         group: the group that a split keeps together.
-        where: the beginning of messages about the file; empty: its path.
+        where: how messages about the file begin; empty: with its path.
         border: number of pixels to cut off each side.
     """
 

@@ -37,8 +37,8 @@ Radii = Mapping[str, float | None]
 class PosedTarget(Photographs):
     """Photographs with poses, which are divided by scenes before any of them is read.
 
-    A subclass says which photographs there are (``listed``) and which ``reader`` reads them. ``split_by`` is searched
-    in ``<scene>/<number>``; None: the photographs of a scene belong together. If a part has more photographs than
+    A subclass lists the photographs (``listed``) and provides their ``reader``. ``split_by`` is searched for in
+    ``<scene>/<number>``; None: the photographs of a scene belong together. If a part has more photographs than
     ``limit``, evenly spaced ones are taken.
 
     Args:
@@ -92,7 +92,7 @@ class PosedTarget(Photographs):
 
     @cached_property
     def _listed(self) -> Listed:
-        """The photographs, checked: there are some for each part, and no scene is in two parts."""
+        """The listed photographs, after checking that no part is empty and no scene is in two parts."""
         listed = self.listed()
         if not listed.val or (listed.test is not None and not listed.test):
             raise ValueError(f"{self._root}: holds no photographs for {'test' if listed.val else 'val'}")

@@ -75,7 +75,7 @@ class RenderedTarget(Target):
         return parts
 
     def _count(self, part: str, biased: bool) -> int:
-        """Return the number of an object's images; with several objects in an image, of those drawn for this one."""
+        """Return the number of an object's images; if images show several objects, of those drawn for this one."""
         if part != "test":
             return self.val_per_object if part == "val" else self.train_per_object
         return self.test_per_biased_object if biased else self.test_per_object

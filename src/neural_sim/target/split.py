@@ -1,4 +1,4 @@
-"""Division of a list of photographs into parts for validation, test and training, by whole groups.
+"""Divide photographs into parts for validation, test and training, by whole groups.
 
 Near-duplicates are recognised by the normalised cross-correlation of local contrast: grey thumbnails of 24 x 24 cells,
 each cell minus the mean of the 5 x 5 cells around it, the best over shifts of up to two cells. Local contrast is used
@@ -43,7 +43,7 @@ COMPARED = 1000
 
 @dataclass(frozen=True)
 class Look:
-    """The properties by which photographs belong together.
+    """The properties that decide which photographs belong together.
 
     Args:
         name: the photograph's own name, for messages.
@@ -65,9 +65,9 @@ class Split:
 
     Args:
         val_fraction: fraction for validation, as near as whole groups allow; the rest is scored.
-        train_fraction: fraction, of the photographs that are not scored, for training, also in whole groups; None:
-            none.
-        split_by: what belongs together, see ``groups_of``; None: what the data set says.
+        train_fraction: fraction of the unscored photographs that is for training, also in whole groups; None: no
+            training set.
+        split_by: which photographs form a group, see ``groups_of``; None: the data set's own groups.
     """
 
     val_fraction: PartOfAll = 0.3
@@ -89,7 +89,7 @@ class Split:
     def unscored(
         self, rows: Sequence[int], groups: Sequence[Hashable], generator: torch.Generator
     ) -> dict[str, list[int]]:
-        """Divide the photographs that are not scored; which ones these are does not depend on ``train_fraction``.
+        """Divide the unscored photographs; which ones these are does not depend on ``train_fraction``.
 
         Args:
             rows: those photographs.
@@ -255,7 +255,7 @@ def split(
 
 
 def nearest(sizes: Sequence[int], wanted: int) -> set[int]:
-    """Choose the ``sizes`` whose sum is nearest to ``wanted``, among all sums except of none and of all.
+    """Choose some of the ``sizes``, not none or all, such that their sum is nearest to ``wanted``.
 
     Subset sum by dynamic programming: bit s of ``reached`` says whether the sizes so far can add up to s;
     ``last[s]`` is the position that first made it possible.
@@ -310,7 +310,7 @@ def joined(groups: Sequence[Hashable], equal: Sequence[Hashable]) -> list[int]:
 
 
 class NearDuplicates(NamedTuple):
-    """Rows of a second part that look like a row of a first, that row for each, and the number that was compared."""
+    """Rows of a second part that resemble rows of a first, the row that each resembles, and the number compared."""
 
     second: list[int]
     first: list[int]

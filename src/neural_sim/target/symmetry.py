@@ -1,4 +1,4 @@
-"""Which bins of a factor an object's symmetry makes equal, so that probability in any of them counts for each."""
+"""Find the bins of a factor that an object's symmetry makes equal; probability in one of them counts for all."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def equivalent_bins(
 
     Two bins belong together if their premultiplied views agree under one of four alignments of the angles within them
     (the offset in the bin and the second angle, each unchanged or mirrored about the middle of its range): the mean
-    absolute difference over the pixels that either view covers must be below ``tolerance``. A second angle that goes
-    round the full circle is also tried half a turn on. Views of every bin use the same ``samples`` offsets and second
+    absolute difference over the pixels that either view covers must be below ``tolerance``. A second angle with a full
+    circle as its range is also shifted by half a turn. Views of every bin use the same ``samples`` offsets and second
     angles; other coordinates are at the middle of their range.
     """
     count = next(f.bins for f in distribution.binned if f.name == factor)
@@ -69,7 +69,7 @@ def _views(
 
 
 def _second_goes_round(distribution: SceneDistribution, factor: str) -> bool:
-    """Whether the angle that is not the factor's own covers the full circle."""
+    """Tell whether the other angle, which is not the factor's own, covers the full circle."""
     own = next(f.coordinate for f in distribution.binned if f.name == factor)
     second = "phi" if own == "rho" else "rho"
     low, high = next(((f.low, f.high) for f in distribution.binned if f.coordinate == second),

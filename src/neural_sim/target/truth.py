@@ -28,7 +28,8 @@ class Truth:
     """The COCO file ``path``, with a detector's classes and the entries of ``photos``.
 
     ``categories`` maps the file's category names to class names, null to leave one out. A photograph's entry is the one
-    whose ``file_name`` is its path below the photographs' folder or the file's folder, else the only one with its name.
+    whose ``file_name`` is its path below the photographs' folder or the file's folder, or else the only one with its
+    name.
 
     Raises:
         ValueError: there is no such file, it is not in COCO form, a category has no class, no photograph has an entry,

@@ -45,9 +45,9 @@ def viewpoint_of(
     and it is turned to face the object by the smallest possible rotation; what remains is the roll. The object's
     position in the image does not affect the angles.
 
-    (phi, rho, roll) and (-phi, rho + pi, roll + pi) are one camera. Of the two, the one within the ranges is taken, or
-    the one that misses them by less; if both are equal in this, such as when both ranges are full circles, the one with
-    the smaller roll. Angles are given within half a turn of the middle of their range. At the poles, where rho and roll
+    (phi, rho, roll) and (-phi, rho + pi, roll + pi) are the same camera. The triple within the ranges is taken, or the
+    one that misses them by less; if they are equal in this, for instance because both ranges are full circles, the one
+    with the smaller roll. Angles are within half a turn of the middle of their range. At the poles, where rho and roll
     have the same effect, rho is 0 or pi.
 
     Args:
@@ -57,7 +57,7 @@ def viewpoint_of(
         rho_range: range of the second angle, in radians.
 
     Raises:
-        ValueError: a camera is at the object's centre, or has it straight behind its back.
+        ValueError: a camera is at the object's centre, or has that centre exactly behind it.
     """
     pose = object_to_camera.double()
     turn, offset = pose[:, :3, :3], pose[:, :3, 3]
@@ -93,10 +93,9 @@ def bins_of_poses(
 ) -> Int[Tensor, "n"]:
     """Return the bin of each pose by the first binned factor of p_psi, from 0, as in ``LabelledImages.bins``.
 
-    Poses are in metres; ``radius`` is that of the object's sphere, None if unknown. -1 if the pose does not determine
-    the
-    factor: a focal length, a distance in radii of an object of unknown size, or no binned factor. A distance outside
-    the range falls into the bin at that end.
+    Poses are in metres; ``radius`` is that of the object's sphere, None if unknown. The bin is -1 if the pose does not
+    determine it: the factor is a focal length, or a distance in radii of an object of unknown size, or there is no
+    binned factor. A distance outside the range falls into the bin at that end.
     """
     unknown = torch.full((len(object_to_camera),), -1)
     first = next(iter(distribution.binned), None)
@@ -129,7 +128,7 @@ def _orbit_axes(phi: Tensor, rho: Tensor) -> tuple[Float[Tensor, "n 3"], Float[T
 def _named(
     phi: Tensor, rho: Tensor, roll: Tensor, phi_range: Range, rho_range: Range
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the same angles in the turn around the middle of their ranges, and the roll in the turn around 0."""
+    """Return the same angles within half a turn of the middle of their ranges, and the roll within half a turn of 0."""
     middles = 0.5 * sum(phi_range), 0.5 * sum(rho_range), 0.0
     phi, rho, roll = (
         middle + torch.remainder(angle - middle + math.pi, TURN) - math.pi

@@ -208,7 +208,7 @@ def _poses(poses: np.ndarray, classes: Sequence[int], meta: Path) -> list[np.nda
 
 
 def _boxes(path: Path, size: tuple[int, int]) -> dict[str, Box | None]:
-    """Read the boxes of whole projections by class, along pixel edges and clipped to the image; None: outside it."""
+    """Read the boxes of whole projections by class, along pixel edges, clipped to the image; None if outside it."""
     lines = _text(path).splitlines()
     boxes: dict[str, Box | None] = {}
     for number, words in enumerate(map(str.split, lines), 1):
@@ -240,7 +240,7 @@ def _check_elements(data: bytes, order: str) -> None:
     """Check the tags of a MATLAB file's elements, nested ones included: scipy crashes on unknown types.
 
     Args:
-        data: elements one after the other: type and size, or both in four bytes for those of up to four, then content.
+        data: consecutive elements: type and size (four bytes each; two each for contents of up to four), then content.
         order: byte order, ``<`` or ``>``.
 
     Raises:
