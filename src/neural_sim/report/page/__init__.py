@@ -1,1 +1,1 @@
-"""report.html: one page that says whether a run worked."""
+"""HTML pages, among them report.html, which says whether a run worked."""

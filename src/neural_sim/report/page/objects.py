@@ -1,4 +1,4 @@
-"""Whether fields show their objects: scores, held-out views beside renders of them, and every bin; objects.html."""
+"""objects.html, which shows the quality of fields: scores, held-out views next to renders of them, and every bin."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class ShownObject:
     """An object on the page.
 
     Args:
-        name: its name.
-        quality: its field's scores and pictures.
+        name: name of the object.
+        quality: scores and pictures of its field.
         real: whether its views are photographs.
-        coverage: of its bins by photographs, by factor; nothing where all sides are known.
+        coverage: coverage of its bins by photographs, by factor; empty if all sides are known.
     """
 
     name: str
@@ -33,7 +33,7 @@ class ShownObject:
 
     @property
     def verdict(self) -> str:
-        """Whether the field shows the object, as a line."""
+        """A line that says how well the field shows the object."""
         psnr, of = self.quality.psnr, "photographs" if self.real else "views"
         if psnr is None:
             return f"not scored: no {of} are held out"
@@ -54,7 +54,7 @@ class ShownObject:
         return [[picture(image) for image in row] for row in zip(*columns, strict=True)]
 
     def tiles(self) -> Iterator[tuple[str, list[tuple[str, str, bool]]]]:
-        """Yield every factor with its bins: the picture, what is said of it, and whether it is left uncovered."""
+        """Yield every factor with its bins: the picture, its caption, and whether photographs leave it uncovered."""
         for factor, images in self.quality.bins.items():
             known = self.coverage.get(factor)
             tiles = []

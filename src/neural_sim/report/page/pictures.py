@@ -1,4 +1,4 @@
-"""Images with boxes, as the page shows them."""
+"""Images with boxes, for the pages."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from neural_sim.report.figures import CLASS_COLOURS
 from neural_sim.types import LabelledImages
 
 SHORTEST = 192
-"""Pixels of a picture's shorter side; boxes on smaller images would be coarse."""
+"""Smallest shorter side of a picture in pixels; on smaller pictures, boxes would be coarse."""
 OVERLAP = 0.5
-"""Intersection over union from which a detection counts as right here."""
+"""Intersection over union from which a detection counts as right on the pages."""
 SHOWN = 0.3
-"""Score from which a detection is shown, and counts on an image without objects."""
+"""Score from which a detection on an image without objects is shown and counts."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Picture:
 
 
 def labelled(images: LabelledImages, rows: Sequence[int], names: Sequence[str]) -> list[Picture]:
-    """Images with their true boxes."""
+    """Return images with their ground-truth boxes."""
     pictures = []
     for row in rows:
         own = images.labels[row] >= 0
@@ -51,7 +51,7 @@ def detected(
     detections: Sequence[Mapping[str, Tensor]],
     names: Sequence[str],
 ) -> list[Picture]:
-    """Images with their true boxes, thin and white, below the best detections, as many as there are objects."""
+    """Return images with their best detections, as many as there are objects, over thin white ground-truth boxes."""
     pictures = []
     for row in rows:
         truth = images.boxes[row][images.labels[row] >= 0]
@@ -63,10 +63,10 @@ def detected(
 
 
 def right(detections: Mapping[str, Tensor], boxes: Tensor, labels: Tensor, score: Score = "AP") -> bool:
-    """Return whether an image's best detections, as many as it has objects, are these objects.
+    """Return whether an image's best detections, as many as it has objects, match these objects.
 
-    Each has the right class and an overlap of ``OVERLAP``; for accuracy the right class alone. An image without objects
-    is right where nothing scores ``SHOWN``.
+    Each must have the right class and an overlap of at least ``OVERLAP``; for accuracy, the right class is enough. An
+    image without objects is right if no detection scores ``SHOWN``.
     """
     best = _best(detections, len(boxes))
     if not len(boxes):

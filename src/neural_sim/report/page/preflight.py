@@ -1,4 +1,4 @@
-"""What is known before an optimisation and whether it is worth it; preflight.html."""
+"""preflight.html, which says whether an optimisation is worth it, by what is known before it."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from neural_sim.types import LabelledImages
 
 FILE = "preflight.html"
 SHOWN = 18
-"""Images of either side."""
+"""Number of images shown of each set."""
 
 
 @dataclass(frozen=True)
 class Preflight:
-    """What is known before an optimisation.
+    """The evidence before an optimisation, and what it says.
 
     Args:
-        experiment: its name.
-        names: of the objects.
+        experiment: name of the experiment.
+        names: names of the objects.
         foreseen: expected gains of every object and factor.
-        level: of significance, over all of them, from which they count.
-        bins: the score of the initial distribution's detector by bin of the validation images.
+        level: family-wise significance level at which they count.
+        bins: scores of the initial distribution's detector by bin of the validation images.
         mismatches: statistics of renders and of the target.
-        settings: what would match them.
-        distance_factor: camera distances times this would match the sizes of boxes; None: they agree.
-        labelled: what numbers of labelled photographs in training are worth; empty where none are for training.
-        score: what detectors are scored by.
-        shown: what the target's boxes show.
-        caution: what a reader must know before all else; empty: nothing.
+        settings: settings that would match them.
+        distance_factor: factor on camera distances that would match the sizes of boxes; None: they agree.
+        labelled: gains of numbers of labelled photographs in training; empty if none are for training.
+        score: the kind of score.
+        shown: the estimate from the target's boxes.
+        caution: a warning to show first; empty: none.
     """
 
     experiment: str
@@ -60,7 +60,7 @@ class Preflight:
 
     @property
     def promising(self) -> list[ExpectedGains]:
-        """Objects and factors of a significant derivative, by Holm's step-down procedure (1979), most gain first."""
+        """Objects and factors with a significant derivative (Holm's step-down procedure, 1979), largest gain first."""
         ordered = sorted(self.foreseen, key=lambda f: f.p_value)
         kept: list[ExpectedGains] = []
         for place, one in enumerate(ordered):
@@ -71,7 +71,7 @@ class Preflight:
 
     @property
     def verdict(self) -> str:
-        """Whether an optimisation is worth it, in one sentence."""
+        """A sentence that says whether an optimisation is worth it."""
         return f"{self.caution} {self._verdict}" if self.caution else self._verdict
 
     @property
@@ -89,12 +89,12 @@ class Preflight:
 
     @property
     def gain(self) -> float:
-        """Expected fall of L_val by a first step of all promising objects and factors."""
+        """Expected fall of L_val from a first step of all promising objects and factors."""
         return sum(f.step for f in self.promising)
 
     @property
     def worth(self) -> str:
-        """What the gain equals in labelled photographs, as a sentence."""
+        """A sentence that gives the equivalent of the gain in labelled photographs."""
         if not self.labelled:
             return (
                 "What that equals in labelled photographs is not known: none are for training "
@@ -113,7 +113,7 @@ class Preflight:
         return f"A first step is worth {equal} of them. {sentence}"
 
     def summary(self) -> str:
-        """Return what is printed."""
+        """Return the printed summary."""
         lines = [
             self.verdict,
             self.worth,
@@ -138,17 +138,17 @@ class Preflight:
 
     @property
     def weak(self) -> list[BinScore]:
-        """The bins where most would be won."""
+        """The bins where most could be gained."""
         return [weakness.score for weakness in weaknesses(self.bins, 3)]
 
     @property
     def differing(self) -> list[Mismatch]:
-        """The statistics that differ by much."""
+        """The statistics with a large and significant difference."""
         return [m for m in self.mismatches if m.counts]
 
     @property
     def advice(self) -> list[str]:
-        """Settings that would match."""
+        """Settings that would reduce the differences."""
         lines = [f"'{key}={value}'" for key, value in self.settings.items()]
         if self.distance_factor is not None:
             keys = "unlearned.distance, or parameter=[zoom] to learn it"
@@ -159,7 +159,7 @@ class Preflight:
 def write_preflight_page(
     report: Preflight, target: LabelledImages, synthesised: LabelledImages, folder: Path, bins: Thumbnails
 ) -> Path:
-    """Write preflight.html; images of both sets, spread over them, are side by side, and ``bins`` are pictured."""
+    """Write preflight.html, with evenly spaced images of both sets side by side and the pictures ``bins``."""
     sides = {
         called: pictures.labelled(
             images, torch.linspace(0, len(images) - 1, min(SHOWN, len(images))).long().tolist(), report.names

@@ -1,4 +1,4 @@
-"""What was learned: psi over the iterations, and every bin with its picture, its share of images and its score."""
+"""The learned psi over the iterations, and every bin with its picture, its share of images and its score."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neural_sim.report.page.weak_bins import BinScore
 from neural_sim.report.run import Learned, RunResults
 
 NEAR = 0.02
-"""Total variation that is no move."""
+"""Total variation below which psi counts as unchanged."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Tile:
     """A bin of an object.
 
     Args:
-        number: from 1.
-        source: of its picture; None: there is none.
-        colour: in the charts.
-        shares: fractions of the object's training images from this bin: ``initial``, ``learned`` and perhaps
+        number: number of the bin, from 1.
+        source: source of its picture; None: there is none.
+        colour: its colour in the charts.
+        shares: fractions of the object's training images from this bin: ``initial``, ``learned`` and, if known,
             ``target``.
         same: other bins that look the same.
-        score: on the test images from this bin; None: there are too few, or bins of this factor are not known.
+        score: score on the test images from this bin; None: there are too few, or bins of this factor are not known.
     """
 
     number: int
@@ -49,11 +49,11 @@ class ObjectPsi:
     """One object's distribution of a factor.
 
     Args:
-        name: of the object.
-        chart: of its probabilities over the iterations.
-        comment: on how it moved, see ``comment``.
-        distances: from the target; empty: not known.
-        tiles: its bins; none of lights.
+        name: name of the object.
+        chart: chart of its probabilities over the iterations.
+        comment: remark on how it moved, see the function ``comment``.
+        distances: distances from the target; empty: not known.
+        tiles: its bins; empty for lights.
     """
 
     name: str
@@ -66,7 +66,7 @@ class ObjectPsi:
 def learned_psi(
     results: RunResults, bins: Thumbnails, scores: Sequence[BinScore]
 ) -> dict[str, list[ObjectPsi]]:
-    """Return what was learned by factor, of the biased objects first; nothing where nothing was."""
+    """Return what was learned, by factor, with biased objects first; empty if nothing was learned."""
     found: dict[str, list[ObjectPsi]] = {}
     for factor in results.factors if results.moved else ():
         for one in sorted(results.of_factor(factor), key=lambda one: one.name not in results.biased):
@@ -101,7 +101,7 @@ def _tiles(
 
 
 def comment(one: Learned, records: Sequence[Mapping[str, Any]]) -> str:
-    """Say what a chart does not: why psi did not move, that it fell back, or that it left the target."""
+    """Say what the chart does not show: why psi did not move, that it went back, or that it moved off the target."""
     backs = [record["taken_back"][one.name] for record in records if one.name in record["taken_back"]]
     if backs:
         kept, accepted = backs[-1]["kept"], backs[-1]["accepted"]
@@ -139,7 +139,7 @@ def psi_chart(learned: Learned) -> str:
 
 
 def shown_chart(one: FactorEstimate) -> str:
-    """Draw what the target shows of one object and factor, with psi's bars next to it."""
+    """Draw the estimate from the target's boxes for one object and factor, next to psi."""
     figure = Figure(figsize=(3.4, 1.9), layout="constrained")
     figures.shown_panel(figure.add_subplot(), one)
     return render.data_uri(figure)

@@ -1,4 +1,4 @@
-"""Templates and figures as the text of a page."""
+"""Render templates and figures as the text of a page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def percent(value: float | None) -> str:
 
 
 def capital(text: str) -> str:
-    """Write a text with a first capital; the rest stays, as in AP."""
+    """Write a text with a capital first letter; unlike ``str.capitalize``, keep the case of the rest (AP)."""
     return text[:1].upper() + text[1:]
 
 
@@ -45,16 +45,16 @@ def page(template: str, **values: Any) -> str:
 
 
 def png_uri(path: Path) -> str | None:
-    """Return a PNG file as the source of an ``<img>``; None where there is no such file."""
+    """Return a PNG file as the source of an ``<img>``; None if there is no such file."""
     if not path.is_file():
         return None
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def data_uri(figure: Figure) -> str:
-    """Return a figure as the source of an ``<img>``: SVG with text that stays text.
+    """Return a figure as the source of an ``<img>``: an SVG whose text stays text.
 
-    An image of its own keeps its ids apart from those of other figures.
+    As separate images, figures cannot confuse their SVG ids.
     """
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neural-sim"}):

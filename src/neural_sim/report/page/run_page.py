@@ -1,4 +1,4 @@
-"""report.html of a run: what was gained, what was learned, how far to trust it, what it cost, what to do next."""
+"""report.html of a run: its gain, the learned psi, how far to trust it, its cost, and what to do next."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from neural_sim.types import LabelledImages
 
 FILE = "report.html"
 PER_OBJECT = {True: 6, False: 2}
-"""Training images shown of an object that is biased, and of another."""
+"""Number of training images shown of an object, by whether it is biased."""
 EXAMPLES = 8
-"""Detections shown of a kind."""
+"""Number of images with detections shown of each kind."""
 DRAWS = 200
-"""Resampled test sets of an interval."""
+"""Number of resampled test sets for an interval."""
 FEWEST = 3
-"""Scored iterations of a curve; a start and an end are in the table."""
+"""Smallest number of scored iterations for a curve; a start and an end alone are in the table."""
 FILES = {
     "results.json": "all numbers",
     "psi.csv": "the learned distribution as a table, for any renderer",
@@ -50,7 +50,7 @@ FILES = {
     "main.log": "what the run said",
     ".hydra/config.yaml": "all settings",
 }
-"""Files that a reader may open next, beside the page."""
+"""Files next to the page that a reader may open."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Shown:
         before: training images from the initial distribution, an equal number of every object in the order of labels.
         after: the same from the learned distribution, drawn with the same random numbers.
         test: the test images.
-        detections: on these, of ns, learned and, where it is known, matched; empty without scores.
+        detections: detections on the test images by ns, learned and, if known, matched; empty without scores.
         bins: pictures of every bin.
     """
 
@@ -74,7 +74,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """AP (or accuracy) of a class by detector, as fractions; None where the test set lacks the class."""
+    """AP (or accuracy) of a class by detector, as fractions; None if the test set lacks the class."""
 
     name: str
     biased: bool
@@ -90,7 +90,7 @@ class RunPage:
 
     @cached_property
     def gains(self) -> dict[str, Gain]:
-        """Gains of the objects that the run is about, of all others, and of each of these that certainly lost."""
+        """Gains of the objects that the run is about, of all others, and of each other object that certainly lost."""
         results = self.results
         if not self.shown.detections:
             return {}
@@ -115,7 +115,7 @@ class RunPage:
 
     @property
     def headline(self) -> str:
-        """Say in one sentence whether it worked."""
+        """A sentence that says whether the run worked."""
         return verdict(self.gains.get("aim"), self.results.score, images=self.results.made.shows)
 
     @cached_property
@@ -126,9 +126,9 @@ class RunPage:
         return bin_scores(names, compared, self.shown.test, score=score) if compared else []
 
     def write(self, commands: Mapping[str, str], folder: Path) -> Path:
-        """Write report.html. Its pictures are in it; it links to its neighbours in ``folder`` alone.
+        """Write report.html, with its pictures embedded and links only to files in ``folder``.
 
-        ``commands`` are what to run next, by what it does.
+        ``commands`` are commands to run next, by what they do.
         """
         results, shown = self.results, self.shown
         names = list(results.names)
@@ -177,7 +177,7 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
 
 
 def score_table(shown: Shown, names: Sequence[str], score: Score) -> ScoreTable:
-    """Score ns, learned and, where it is known, matched on the test images and on resampled ones."""
+    """Score ns, learned and, if known, matched on the test images and on resampled ones."""
     outcomes = {
         which: [[match(shown.detections[which], shown.test, label, score) for label in range(len(names))]]
         for which in ("ns", "learned", "matched")
@@ -217,10 +217,10 @@ def curve_chart(
     """Draw the mean score of some classes against the method's seconds.
 
     Args:
-        curve: what was spent and scored, with scores as fractions.
-        names: of the classes.
+        curve: costs and scores (as fractions) of the scored iterations.
+        names: names of the classes.
         bounds: scores of other detectors by name, drawn as lines.
-        score: what these are.
+        score: the kind of score.
     """
     figure = Figure(figsize=(6.2, 2.9), layout="constrained")
     axes = figure.add_subplot()
@@ -242,7 +242,7 @@ def curve_chart(
 
 
 def _apart(seconds: Sequence[float], least: float = 0.08) -> list[int]:
-    """Return the points whose labels do not meet: the last, and going back each that is far enough from the next."""
+    """Return the points whose labels do not overlap: from the last backwards, each that is far enough from the next."""
     width, kept = least * (seconds[-1] or 1.0), [len(seconds) - 1]
     for place in range(len(seconds) - 2, -1, -1):
         if seconds[kept[-1]] - seconds[place] >= width:
@@ -261,7 +261,7 @@ def _training(images: LabelledImages, results: RunResults) -> list[Picture]:
 
 
 def _examples(shown: Shown, names: Sequence[str], score: Score) -> dict[str, list[Picture]]:
-    """Return test images by what the training on the learned distribution changed, a few of each kind."""
+    """Return a few test images of each kind, by how training on the learned distribution changed their detections."""
     test, kinds = shown.test, {"won": [], "lost": [], "still wrong": [], "right": []}
     for row in range(len(test)):
         own = test.labels[row] >= 0

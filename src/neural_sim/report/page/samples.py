@@ -1,4 +1,4 @@
-"""Some images of an exported data set with their labels, and what is in it; samples.html."""
+"""samples.html, which shows some images of an exported data set with their labels, and counts its content."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from neural_sim.synthesis.export.masks import mask_of, outlines
 
 FILE = "samples.html"
 SHOWN = 24
-"""Images on the page."""
+"""Number of images on the page."""
 SIDE = 400
-"""Pixels along the longer side of one."""
+"""Longer side of an image in pixels."""
 
 Record = Mapping[str, Any]
-"""Of an image, see ``synthesis.export.folder.record_of``."""
+"""The record of an image, see ``synthesis.export.folder.record_of``."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Labels:
     """The labels of a class.
 
     Args:
-        name: of the class.
-        count: of its labelled objects.
-        hidden: objects of which too little is visible for a label.
-        sides: quartiles of the square roots of its boxes' areas in pixels; empty without any.
+        name: name of the class.
+        count: number of its labelled objects.
+        hidden: number of its objects of which too little is visible for a label.
+        sides: quartiles of the square roots of its boxes' areas in pixels; empty without boxes.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Labels:
 
     @staticmethod
     def of(name: str, items: Sequence[Mapping[str, Any]]) -> Labels:
-        """Count objects of a class."""
+        """Count the objects of a class."""
         boxes = [item["box_visible"] for item in items if item["labelled"]]
         sides = [(width * height) ** 0.5 for _, _, width, height in boxes]
         quartiles = statistics.quantiles(sides, n=4, method="inclusive") if len(sides) > 1 else sides
@@ -60,9 +60,9 @@ def write_samples_page(
 
     Args:
         root: the folder.
-        records: of all its images.
-        names: of the classes.
-        parts: the records of each part; none where there is no split.
+        records: records of all its images.
+        names: names of the classes.
+        parts: records of each part; empty if there is no split.
     """
     items = [item for record in records for item in record["objects"]]
     by_class = [
@@ -82,7 +82,7 @@ def write_samples_page(
 
 
 def _labelled(root: Path, record: Record, names: Sequence[str]) -> Picture:
-    """Return an image with its boxes, and the outlines of its visible masks."""
+    """Return an image with its boxes and the outlines of its visible masks."""
     image = read_picture(root / record["file"], upright=False).convert("RGB")
     scale = SIDE / max(image.size)
     image = image.resize((round(scale * image.width), round(scale * image.height)))

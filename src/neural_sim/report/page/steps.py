@@ -1,4 +1,4 @@
-"""What became of every object's step in every iteration."""
+"""The outcome of every object's step in every iteration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNJUDGED: Mapping[str, Kind] = {
     "waited": "waited",
     "skipped": "skipped",
 }
-"""What a step is that nothing has judged, by the certificate's action; the first that any factor of it has."""
+"""The kind of a step that was not judged, by the certificate's actions; the first that any factor has is shown."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class StepRow:
 
 
 def step_rows(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[StepRow]:
-    """Rows of the objects; none where the method takes no hypergradient.
+    """Return one row per object; none if the method computes no hypergradient.
 
-    A checked step is judged when the next iteration begins, so its verdict is in the next record.
+    A step is judged when the next iteration begins, so its verdict is in the next record.
     """
     steps = [record for record in records if record["certificate"]]
     if not steps:

@@ -1,4 +1,4 @@
-"""Whether a run worked, as numbers with intervals and in one sentence."""
+"""Judge whether a run worked, by numbers with intervals and in one sentence."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Gain:
     """AP (or accuracy) of a set of classes, as fractions.
 
     Args:
-        names: of the classes.
-        ap: of the detectors ns, learned and, where the target's distribution is known, matched.
+        names: names of the classes.
+        ap: scores of the detectors ns, learned and, if the target's distribution is known, matched.
         gain: learned minus ns, with its 95 % interval.
-        room: matched minus ns; None where the two are one distribution, and where matched is not known.
+        room: matched minus ns; None if both distributions are the same, or matched is not known.
     """
 
     names: tuple[str, ...]
@@ -37,7 +37,7 @@ class Gain:
         """Read the gain of a table's classes.
 
         Args:
-            table: of the detectors ns, learned and perhaps matched.
+            table: scores of the detectors ns, learned and perhaps matched.
             same_target: whether the target's distribution is the initial one.
         """
         known = "matched" in table.detectors and not same_target
@@ -47,35 +47,35 @@ class Gain:
 
     @property
     def outcome(self) -> Outcome:
-        """What the interval of the gain allows to say."""
+        """The conclusion that the interval of the gain allows."""
         if not self.gain.certain:
             return "no difference"
         return "better" if self.gain.value > 0.0 else "worse"
 
     @property
     def closed(self) -> float | None:
-        """Fraction of the room that the gain fills; None where the room's interval includes 0."""
+        """Fraction of the room that the gain fills; None if the room's interval includes 0."""
         if self.room is None or not self.room.certain or self.room.value <= 0.0:
             return None
         return self.gain.value / self.room.value
 
 
 def listed(names: Sequence[str]) -> str:
-    """Write names as a sentence has them: ``a, b and c``."""
+    """Write names as in a sentence: ``a, b and c``."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1, images: str = "test images") -> str:
     """Say in one sentence whether the run worked.
 
-    That it worked is said of several trainings alone. The interval of one is over test images, and trainings on
-    distributions that are as good as each other often differ by more.
+    Only several trainings can show that it worked. The interval for one training is over test images, and trainings on
+    equally good distributions often differ by more.
 
     Args:
-        gain: None where no detector was scored.
-        score: what the gain is of.
-        trainings: of each distribution.
-        images: what they were scored on.
+        gain: the gain; None if no detector was scored.
+        score: the kind of score.
+        trainings: number of trainings on each distribution.
+        images: kind of images that were scored.
     """
     if gain is None:
         return f"The detectors were not scored on {images}, so whether it worked is not known."

@@ -1,4 +1,4 @@
-"""AP, or accuracy, by the bin of the target images: where the detector is still weak, and what was forgotten."""
+"""AP or accuracy by bin of the target images, to find where the detector is still weak and what it has forgotten."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from neural_sim.report.score_table import ScoreTable
 from neural_sim.types import LabelledImages
 
 Detections = Mapping[str, Sequence[Mapping[str, Tensor]]]
-"""Of every image, by detector."""
+"""The detections on every image, by detector."""
 LEAST = 0.005
-"""Of a score: a smaller gain is not worth a sentence."""
+"""Smallest gain or loss in score that is worth a sentence."""
 DRAWS = 100
-"""Resampled images of a bin, for the interval of what was lost there."""
+"""Number of times that a bin's images are resampled, for the interval of its loss."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class BinScore:
     """Scores of an object on the images that show it from one bin.
 
     Args:
-        name: of the object.
-        bin: from 1.
-        images: their number.
-        fraction: the part of the object's images that are from this bin.
-        ap: AP or accuracy (a fraction) by detector: the one before, and perhaps ``learned`` and ``matched``.
+        name: name of the object.
+        bin: number of the bin, from 1.
+        images: number of images.
+        fraction: fraction of the object's images that are from this bin.
+        ap: AP or accuracy (a fraction) by detector: ``ns``, and perhaps ``learned`` and ``matched``.
     """
 
     name: str
@@ -43,17 +43,17 @@ class BinScore:
 
     @property
     def last(self) -> float:
-        """AP of the detector in question: that of the learned distribution, if there is one."""
+        """AP of the detector of the learned distribution; if there is none, of the initial one."""
         return self.ap.get("learned", self.first)
 
     @property
     def first(self) -> float:
-        """AP of the detector before."""
+        """AP of the detector of the initial distribution."""
         return self.ap["ns"]
 
     @property
     def change(self) -> float:
-        """From the detector before to the one in question."""
+        """Change of AP from the initial to the learned distribution."""
         return self.last - self.first
 
 
@@ -62,8 +62,8 @@ class Weakness:
     """A bin that scores less than the object's best bin, or than the detector of the target's own distribution there.
 
     Args:
-        score: of the bin.
-        best: of the object's best bin.
+        score: scores of the bin.
+        best: scores of the object's best bin.
     """
 
     score: BinScore
@@ -71,22 +71,22 @@ class Weakness:
 
     @property
     def own(self) -> float | None:
-        """What training on the target's own distribution reaches in this bin; None: not known."""
+        """AP in this bin after training on the target's own distribution; None: not known."""
         return self.score.ap.get("matched")
 
     @property
     def lacking(self) -> float:
-        """AP that the bin lacks."""
+        """AP by which the bin falls short."""
         return max(self.best.last, self.own or 0.0) - self.score.last
 
     @property
     def gain(self) -> float:
-        """What that adds to the object's AP, about: its part of the object's images times what it lacks."""
+        """Approximate gain in the object's AP: the bin's fraction of its images, times the AP that it lacks."""
         return self.score.fraction * self.lacking
 
     @property
     def reason(self) -> str:
-        """What it is held against, and what that says of the cause."""
+        """A text that says what the bin is compared with, and what that suggests about the cause."""
         parts = []
         if self.best.last > self.score.last:
             parts.append(f"bin {self.best.bin} has {100 * self.best.last:.0f}")
@@ -104,7 +104,7 @@ class Weakness:
 
 @dataclass(frozen=True)
 class Forgotten:
-    """A bin on whose images the detector in question is certainly worse than the one before, and by how much."""
+    """A bin in which the detector ``learned`` is significantly worse than ``ns``, and by how much."""
 
     score: BinScore
     loss: Estimate
@@ -117,13 +117,13 @@ def bin_scores(
     at_least: int = 5,
     score: Score = "AP",
 ) -> list[BinScore]:
-    """Score every object's bins that have images enough; images of unknown bins are left out.
+    """Score every object's bins that have enough images; images of unknown bins are left out.
 
     Args:
-        names: of the objects.
-        detections: of each detector.
+        names: names of the objects.
+        detections: detections of each detector.
         test: the test images.
-        at_least: images of a bin.
+        at_least: smallest number of images of a bin.
         score: AP or accuracy.
     """
     scores = []
@@ -142,7 +142,7 @@ def bin_scores(
 
 
 def weaknesses(scores: Sequence[BinScore], count: int = 5) -> list[Weakness]:
-    """Return the bins where most would be won, the largest gain first."""
+    """Return the bins where most could be gained, the largest gain first."""
     found = [
         Weakness(one, max(own, key=lambda other: other.last))
         for own in by_object(scores).values()
@@ -158,9 +158,9 @@ def forgotten(
     test: LabelledImages,
     score: Score = "AP",
 ) -> list[Forgotten]:
-    """Return the bins that certainly lost from ns to learned, by resampling their images.
+    """Return the bins with a significant loss from ns to learned, by resampling their images.
 
-    The one that costs its object most comes first.
+    The bin that costs its object most comes first.
     """
     found = []
     for one in scores:
@@ -188,7 +188,7 @@ def by_object(scores: Sequence[BinScore]) -> dict[str, list[BinScore]]:
 
 
 def _bins_shown(test: LabelledImages, label: int) -> Bool[Tensor, "images bins"]:
-    """Return which images show an object from which bin."""
+    """Return, for each bin, which images show the object from it."""
     own = test.labels == label
     bins = test.bins if test.bins.ndim == 2 else test.bins[:, None].expand_as(test.labels)
     known = own & (bins >= 0)
