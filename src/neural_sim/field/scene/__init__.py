@@ -1,1 +1,1 @@
-"""A field of a whole captured scene, and masks of the object in it."""
+"""Fit a field of a whole captured scene, and render masks of the object in it."""

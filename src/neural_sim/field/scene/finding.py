@@ -1,4 +1,4 @@
-"""Which part of a fitted scene is the object."""
+"""Find the object in a fitted scene."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ THICK = 0.75
 
 @dataclass(frozen=True)
 class Found:
-    """The object's region in the normalised frame, with what is needed to draw it.
+    """The object's region in the normalised frame, and its place in the capture's.
 
-    The centre, radius and box are in the capture's frame. ``occupied`` are the cells of the field without fog.
+    Centre, radius and box are in the capture's frame. ``occupied`` marks the field's cells without fog.
     """
 
     frame: Frame
@@ -103,10 +103,10 @@ def find(
 def _boxed(
     grid: SceneGrid, largest: Float[Tensor, "cells"], plane: Plane | None, frame: Frame, box: Corners
 ) -> Region | None:
-    """Find everything in the box that is above the plane, if that crosses its lower half; None if nothing is solid."""
+    """Find everything in the box above the plane, if the plane crosses its lower half; None if nothing is solid."""
     low, high = (frame.into(torch.tensor(corner)) for corner in box)
     if plane is not None and float(plane.height(0.5 * (low + high))) < 0.0:
-        plane = None  # the box is below it: it is no plane that the object stands on
+        plane = None  # the box's centre is below it, so the object does not stand on it
     centres = expand(cell_centres(grid.resolution))
     inside: Bool[Tensor, "cells"] = ((centres > low) & (centres < high)).all(-1)
     region = Region(inside, grid.resolution, plane, GROUND * grid.edge)

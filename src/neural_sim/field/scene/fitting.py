@@ -1,4 +1,4 @@
-"""Fitting of a scene's grid to photographs: which samples count, the loss, and the optimiser's steps."""
+"""Fit a scene's grid to photographs: the samples that count, the loss, and the optimiser's steps."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ MARK_EVERY = 16
 class ScenePixels:
     """Pixels of all photographs with their rays in the capture's frame.
 
-    ``photo`` numbers each pixel's photograph. ``detail`` is how much the photograph changes from one pixel to the next:
-    without such change, the depth is uncertain.
+    ``photo`` is the index of each pixel's photograph. ``detail`` is how much the photograph changes between adjacent
+    pixels; without such change, the depth is uncertain.
     """
 
     origins: Float[Tensor, "pixels 3"]
@@ -54,7 +54,7 @@ class ScenePixels:
 
 @dataclass(frozen=True)
 class Visible:
-    """The samples of rays that may count.
+    """The samples of rays that may contribute.
 
     ``samples.distance``, in [0, 1], is the place along a ray as a fraction of its lattice; ``samples.width`` is a
     contracted length.
@@ -68,7 +68,7 @@ class Visible:
 
 @torch.no_grad()
 def visible(grid: SceneGrid, rays: Rays, phase: Float[Tensor, "rays"], count: int) -> Visible:
-    """Select, from ``count`` samples a ray, those in occupied cells that light reaches."""
+    """Select, from ``count`` samples per ray, those in occupied cells that light reaches."""
     positions, width = along_rays(rays.origins, rays.directions, phase, count)
     kept = grid.in_occupied(positions)
     ray, number = kept.nonzero().unbind(1)
@@ -93,8 +93,8 @@ def loss_of(
 ) -> Float[Tensor, ""]:
     """Compute the mean squared error of colours, plus ``SMOOTHNESS`` times the total variation at some vertices.
 
-    Each photograph has its own exposure, a factor exp(log_gain). Where light passes the whole scene, ``behind`` is
-    seen: drawn at random in every step, it teaches the field to be opaque.
+    Each photograph has its own exposure, a factor exp(log_gain). Light that passes the whole scene shows the colour
+    ``behind``, which is drawn at random in every step and so teaches the field to be opaque.
     """
     raw = grid.raw(seen.corners, seen.weights)
     weights = render_weights(grid.density(raw[:, 0]), seen.samples)
@@ -107,9 +107,9 @@ def loss_of(
 
 @dataclass(frozen=True)
 class Budget:
-    """The budget of one fit: ``steps`` of ``batch_rays`` rays, and the cells a side at its end.
+    """The budget of one fit: ``steps`` of ``batch_rays`` rays, and the final number of cells per side.
 
-    The number of cells a side doubles to that after a third of the steps.
+    The number of cells per side doubles to this after a third of the steps.
     """
 
     steps: int
@@ -158,7 +158,7 @@ def fit(
         vertices = torch.randint(len(grid.table), (SMOOTHED,), generator=generator)
         centred = log_gain - log_gain.mean(
             0
-        )  # a common factor on all photographs is the field's own brightness
+        )  # a factor common to all photographs is the field's own brightness
         loss = loss_of(grid, seen, pixels.colours[index], centred[pixels.photo[index]], behind, vertices)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()

@@ -39,7 +39,7 @@ class SceneGrid:
 
     @property
     def samples(self) -> int:
-        """Number of samples on a ray: in the unit ball they are about a cell apart."""
+        """Number of samples on a ray, which are about a cell apart in the unit ball."""
         return round(0.75 * self.resolution)
 
     @property
@@ -71,14 +71,14 @@ class SceneGrid:
         return functional.softplus(GAIN * raw) / self.edge
 
     def in_occupied(self, contracted: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-        """Whether points lie in cells that ``mark`` has kept."""
+        """Tell whether points lie in cells that ``mark`` has kept."""
         return self.occupied[cells_of(contracted, self.resolution)]
 
     def variation(self, vertices: Int[Tensor, "some"]) -> Float[Tensor, ""]:
         """Compute the total variation of the absorbed fraction of a cell's edge.
 
-        It is the mean length of the differences to the next vertex along each axis. Of all surfaces that explain the
-        photographs equally well, the smoothest has the lowest.
+        It is the mean length of the differences to the next vertex along each axis. It is lowest for the smoothest of
+        all surfaces that explain the photographs equally well.
         """
         side = self.resolution + 1
         last = len(self.table) - 1
@@ -91,7 +91,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def mark(self) -> None:
-        """Find again which cells may hold anything: those with a vertex that absorbs more than ``EMPTY``."""
+        """Update the occupied cells: those with a vertex that absorbs more than ``EMPTY``."""
         absorbed = -torch.expm1(-functional.softplus(GAIN * self.table[:, 0]))
         side = self.resolution + 1
         largest = functional.max_pool3d(absorbed.view(1, 1, side, side, side), 2, 1)
@@ -110,7 +110,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def refined(self) -> SceneGrid:
-        """Resample the field onto twice as many cells a side; absorbed fractions halve with the edge."""
+        """Resample the field onto twice as many cells per side; absorbed fractions halve with the edge."""
         side, finer = self.resolution + 1, 2 * self.resolution + 1
         values = self.table.detach().view(side, side, side, 4).permute(3, 0, 1, 2)[None]
         table = functional.interpolate(values, (finer, finer, finer), mode="trilinear", align_corners=True)

@@ -64,12 +64,12 @@ def supporting_plane(
     tolerance: float,
     generator: torch.Generator,
 ) -> Plane | None:
-    """Find the plane below the object at the origin; None without one (all in the normalised frame).
+    """Find the plane below the object at the origin; None if there is none. All inputs are in the normalised frame.
 
-    It is found by random samples of three points (RANSAC, Fischler and Bolles 1981), as the plane with most points
-    within ``tolerance`` and few just below it, and then fitted by least squares. It must have cameras above it and
-    something standing on it near the origin, and extend farther than that; the top of a box or the foot of a lamp does
-    not.
+    RANSAC (Fischler and Bolles 1981) finds, from random samples of three points, the plane with most points within
+    ``tolerance`` and few just below it, which is then fitted by least squares. There must be cameras above it and
+    something standing on it near the origin, and it must extend farther than that; the top of a box or the foot of a
+    lamp does not.
     """
     near = points[points.norm(dim=-1) < NEARBY].double()
     left = torch.ones(len(near), dtype=torch.bool)
@@ -87,7 +87,7 @@ def supporting_plane(
 
 
 def refitted(plane: Plane, points: Float[Tensor, "n 3"], tolerance: float) -> Plane:
-    """Refit a roughly known plane to the points on it by least squares, with tolerances that fall to ``tolerance``."""
+    """Refit a roughly known plane to its points by least squares, with tolerances that decrease to ``tolerance``."""
     near = points[points.norm(dim=-1) < AROUND].double()
     up = torch.tensor(plane.normal, dtype=torch.float64)
     for width in (4.0, 2.0, 1.0, 1.0, 1.0):
@@ -121,7 +121,7 @@ def _best(
 def _fitted(
     plane: Plane, points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], tolerance: float
 ) -> Plane | None:
-    """Fit a plane to the points within its tolerance, those below weighted by ``BELOW``; None with fewer than three."""
+    """Fit a plane to the points within tolerance, with weight ``BELOW`` below it; None if fewer than three."""
     height = plane.height(points)
     near = height.abs() < tolerance
     on = points[near]

@@ -1,4 +1,4 @@
-"""Masks of the object in a captured scene, found twice: in a coarse field of everything, then in a finer one."""
+"""Compute masks of the object in a captured scene, from a coarse field of the whole scene, then from a finer one."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ LEAST_PIXELS = 80
 class SceneMasks:
     """Masks from a field of the whole scene.
 
-    A first field, of half the resolution, finds the supporting plane and what stands on it where the cameras look. The
-    second has the object in the middle of its space, where its cells are finest; its masks are rendered.
+    In a first field of half the resolution, the supporting plane is found, and on it the object that the cameras look
+    at. The second field has the object at its centre, where its cells are finest, and renders the masks.
 
     Args:
         image_size: longer side in pixels of the photographs that train the field, and of the masks.
         resolution: number of the field's cells along each side of contracted space.
         steps: budget of optimiser steps.
-        batch_rays: rays in a step.
+        batch_rays: number of rays in a step.
         seed: seed of the order of rays; separate from the run's seed, so that runs share masks.
     """
 
@@ -63,8 +63,8 @@ class SceneMasks:
         """Compute the object's opacity in [0, 1] in each photograph, ``image_size`` pixels along its longer side.
 
         ``up`` is in the capture's frame; None: its file's, or else the mean of the cameras' up vectors. With ``box``,
-        the object is what is in it and above the plane; None: what is connected and nearest to the point at which the
-        cameras look.
+        the object is everything in the box above the plane; without it, it is the connected part nearest to the point
+        that the cameras look at.
 
         Raises:
             ValueError: the cameras do not look at one place, no object is found, or the box is empty.
@@ -99,14 +99,14 @@ class SceneMasks:
         generator: torch.Generator,
         start: SceneGrid | None = None,
     ) -> tuple[ScenePixels, SceneGrid]:
-        """Fit a field with these cells and steps to the photographs, reduced to a fraction of their pixels a side."""
+        """Fit a field with the fraction ``part`` of the pixels per side, steps and cells per side."""
         pixels = scene_pixels(capture, min(self.image_size, max(LEAST_PIXELS, round(part * self.image_size))))
         budget = Budget(max(1, round(part * self.steps)), self.batch_rays, round(part * self.resolution))
         return pixels, fit(pixels, frame, budget, generator, start).grid
 
 
 def _tell(capture: Capture, found: Found, masks: tuple[Tensor, ...]) -> None:
-    """Log what was found as the object."""
+    """Log the object that was found."""
     covered = [float((mask > 0.5).float().mean()) for mask in masks]
     low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in found.box)
     plane = found.region.plane

@@ -1,4 +1,4 @@
-"""The part of a scene that is the object: connected cells of a grid near the origin, above the supporting plane."""
+"""Find the cells of a scene's grid that are the object: connected, near the origin, above the supporting plane."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ GROUND = 1.0
 
 @dataclass(frozen=True)
 class Region:
-    """``cells`` of a grid, of which the part more than ``ground`` above the plane counts, in the normalised frame."""
+    """The part of a grid's ``cells`` that lies more than ``ground`` above the plane, in the normalised frame."""
 
     cells: Bool[Tensor, "cells"]
     resolution: int
@@ -50,7 +50,7 @@ class Region:
     ground: float
 
     def holds(self, contracted: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Whether contracted positions lie in the object."""
+        """Tell whether contracted positions lie in the object."""
         inside = self.cells[cells_of(contracted, self.resolution)]
         if self.plane is not None:
             inside &= self.plane.height(expand(contracted)) > self.ground
@@ -82,7 +82,7 @@ def connected_region(
 ) -> Region | None:
     """Find the connected part nearest to the origin; None if there is nothing.
 
-    ``within``, if given, holds the object and little else: everything solid in it is taken.
+    ``within``, if given, holds the object and little else, so that everything solid in it is taken.
     """
     shows, allowed = surface.largest > SHOWS, _allowed(grid, plane, APART)
     if within is not None:
@@ -90,7 +90,7 @@ def connected_region(
         return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
     centres = expand(cell_centres(grid.resolution))
     distance = centres.norm(dim=-1) if plane is None else plane.from_axis(centres)
-    # Large cells, and fields with few steps, also have ends of rays in the air: a solid cell must then end more rays.
+    # With large cells or few steps, some rays also end in the air, so that a solid cell must end more of them.
     for least in (HITS, 2 * HITS, 4 * HITS, 8 * HITS, math.inf):
         solid = (shows | (surface.hits >= least)) & allowed
         reach = _apart(distance[solid], 3 if plane is None else 2, grid.edge)
@@ -101,10 +101,10 @@ def connected_region(
 
 
 def _apart(distance: Float[Tensor, "solid"], dimensions: int, edge: float) -> float | None:
-    """Find the distance from the origin at which the object ends; None if nothing is set apart.
+    """Find the distance from the origin at which the object ends; None if no gap surrounds it.
 
-    Rings two cells wide are compared with what they enclose, in solid cells per volume: around an object there is a
-    ring that is much emptier, even if an error of the field bridges it.
+    The density of solid cells in rings two cells wide is compared with the density inside them: around an object, there
+    is a ring that is much emptier, even if an error of the field bridges it.
     """
     inner = torch.arange(3, int(FARTHEST / edge)) * edge
     within = (distance[None] < inner[:, None]).sum(1)
@@ -145,10 +145,10 @@ def _large_parts(solid: Bool[Tensor, "cells"], side: int) -> Bool[Tensor, "cells
 
 
 def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[Tensor, "cells"]:
-    """Select the cells in which light ends, with their neighbours and the region's own; all others hold fog.
+    """Select the cells in which rays end, their neighbours, and the region's own cells; all others hold fog.
 
-    In front of few cameras, and where they see little, a field explains their photographs by something thin in the air.
-    No ray ends in it, or only few in one place; in a mask it would hide the object.
+    Where few cameras look, a field explains their photographs by thin fog in the air. No rays end in it, or only a few
+    in one place, but in a mask it would hide the object.
     """
     side = grid.resolution
     label, count = _labelled(surface.hits >= HITS, side)
@@ -159,10 +159,10 @@ def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[T
 
 
 def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:
-    """Return the region of all cells inside the convex hull of these and their neighbours.
+    """Return the region of all cells in the convex hull of the given cells and their neighbours.
 
-    A hollow, such as a mug's, shows surfaces that few photographs see and that stay faint; within the hull they belong
-    to the object. Empty parts of the hull absorb nothing and stay out of the masks.
+    Surfaces inside a hollow, such as a mug's, are seen by few photographs and stay faint; the hull includes them. Empty
+    parts of the hull absorb nothing and do not show in masks.
     """
     side = grid.resolution
     fringe: np.ndarray = np.asarray(

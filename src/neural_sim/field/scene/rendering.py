@@ -1,4 +1,4 @@
-"""A mask of the object in a photograph: the opacity of its region, as far as nothing in front hides it."""
+"""Render the mask of the object in a photograph: the opacity of its region where nothing in front hides it."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ FOG = 4.0
 
 @torch.no_grad()
 def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) -> Float[Tensor, "h w"]:
-    """Compute the object's opacity in [0, 1] at each pixel, as far as no solid thing in front hides it.
+    """Compute the object's opacity in [0, 1] at each pixel, where nothing solid in front hides it.
 
-    Fog does not hide it: with few photographs from a side, a field explains the rest by something thin in the air,
-    which would hide the object behind it.
+    Fog counts as transparent: from sides with few photographs, a field explains these by something thin in the air,
+    which would otherwise hide the object.
     """
     height, width = rays.seen.shape
     directions = rays.directions.reshape(-1, 3).float()
@@ -53,7 +53,7 @@ def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) 
 
 
 def without_pinholes(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Fill holes that are small for the object, as in walls that few photographs show; a handle's hole is larger."""
+    """Fill holes that are small for the object, as in walls that few photographs show; handles have larger ones."""
     solid = (mask > 0.5).numpy()
     holes, count = scipy.ndimage.label(~solid)  # pyright: ignore[reportGeneralTypeIssues]
     sizes = np.bincount(holes.ravel(), minlength=count + 1)
@@ -69,7 +69,7 @@ def _meets(
     low: Float[Tensor, "3"],
     high: Float[Tensor, "3"],
 ) -> Bool[Tensor, "n"]:
-    """Whether rays pass through a box (slab test)."""
+    """Tell whether rays pass through a box (slab test)."""
     slope = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
     one, other = (low - origin) / slope, (high - origin) / slope
     return torch.minimum(one, other).amax(1).clamp_min(0.0) <= torch.maximum(one, other).amin(1)

@@ -20,7 +20,7 @@ FAR = 100.0
 
 @dataclass(frozen=True)
 class Frame:
-    """The normalised frame: the capture's moved by -``centre`` and divided by ``unit``, both in the capture's frame."""
+    """The normalised frame: the capture's, shifted by -``centre`` and divided by ``unit``, both in the capture's."""
 
     centre: tuple[float, float, float]
     unit: float

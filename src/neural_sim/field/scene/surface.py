@@ -1,4 +1,4 @@
-"""What photographs see of a scene: points of its surface, and the cells that are visible."""
+"""Find what photographs show of a scene: points of its surface, and the visible cells."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ AT_ONCE = 4096
 class SeenSurface:
     """The surfaces that rays meet.
 
-    ``points`` are where a ray has lost half of its light, in the normalised frame, with their number in each of the
-    grid's cells; ``largest`` is the largest contribution of each cell to any pixel.
+    ``points`` are the places where rays have lost half of their light, in the normalised frame; ``hits`` is their
+    number in each of the grid's cells; ``largest`` is the largest contribution of each cell to any pixel.
 
-    A field with few steps spreads a surface over several cells, each of which contributes little; the point where half
-    of the light is lost is well defined all the same.
+    A field with few steps spreads a surface over several cells, each of which contributes little; but the point where
+    half of the light is lost remains well defined.
     """
 
     points: Float[Tensor, "hits 3"]
