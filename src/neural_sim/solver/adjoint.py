@@ -97,7 +97,7 @@ class AdjointSolver:
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
     ) -> Solution:
-        """Solve at ``times`` lambda, starting from the damping's Krylov search if there is one, else from ``x0``."""
+        """Solve at ``times`` lambda, starting from the damping's Krylov search or, without one, from ``x0``."""
         searched = damped.search(times)
         start = x0 if searched is None else searched
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)

@@ -60,7 +60,7 @@ class Solution:
 class Iterate:
     """Where an iteration stopped; CONVERGED here is a claim that ``LinearSolver.solve`` checks.
 
-    ``residual`` is the norm of ``rhs - A value`` from a fresh product if the iteration ended with one, else None.
+    ``residual`` is the norm of ``rhs - A value`` from a fresh product, or None if the iteration did not end with one.
     """
 
     value: Float[Tensor, "n"]

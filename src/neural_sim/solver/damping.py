@@ -60,7 +60,7 @@ class Damping(abc.ABC):
 class FixedDamping(Damping):
     """A given lambda, for instance 0 where the inner problem's own proximal term bounds its curvature.
 
-    ``lanczos_steps`` > 0 estimates the spectrum all the same, for the log.
+    With ``lanczos_steps`` > 0 the spectrum is still estimated, for the log.
     """
 
     value: NonNegative

@@ -76,7 +76,7 @@ class Spectrum:
     krylov: Krylov | None = None
 
     def condition(self, shift: float = 0.0) -> float:
-        """Condition number of A + shift I if the Ritz values show it positive definite, else inf."""
+        """Condition number of A + shift I if the Ritz values show it positive definite; otherwise inf."""
         low, high = self.smallest + shift, self.largest + shift
         return high / low if low > 0.0 else math.inf
 
