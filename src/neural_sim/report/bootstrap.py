@@ -36,7 +36,7 @@ class Matches:
 
 @dataclass(frozen=True)
 class Hits:
-    """Images of one class (``boxes_per_image`` 1, else 0), and whether the best class of each image is this one."""
+    """Images of one class (where ``boxes_per_image`` is 1), and whether each image's best class is this one."""
 
     correct: Bool[np.ndarray, "images"]
     boxes_per_image: Int[np.ndarray, "images"]
@@ -49,7 +49,7 @@ Outcomes = Matches | Hits
 def match(
     predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int, score: Score = "AP"
 ) -> Outcomes:
-    """Compute the outcomes from which the score of one class is computed.
+    """Match the predictions of one class with its labels, as the basis of the class's score.
 
     For AP, detections are matched by COCO's rules: in each image from the best on, each to the unmatched box with
     which it overlaps most.

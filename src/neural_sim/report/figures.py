@@ -218,7 +218,7 @@ def strip_figure(
     height, width = target.images.shape[-2:]
     head, gap, inch = round(0.2 * height), round(0.25 * width), width  # an image is an inch wide
     chosen = _first(results, rows)
-    across = sum(STRIP.values()) * width + len(STRIP) * gap + 2 * inch  # two inches of words
+    across = sum(STRIP.values()) * width + len(STRIP) * gap + 2 * inch  # two inches of text
     canvas = np.ones((head + len(chosen) * height, across, 3), dtype=np.float32)
     figure = Figure(figsize=(across / inch, len(canvas) / inch))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
