@@ -67,7 +67,7 @@ class Album:
 
 
 def pictures_of(folder: Path) -> list[Path]:
-    """Return the photographs in a capture's folder: all in ``images``, else those in the folder itself."""
+    """Return the photographs in a capture's folder: those in its folder ``images`` if it exists, otherwise its own."""
     if (folder / FOLDER).is_dir():
         return picture_files(folder / FOLDER)
     own = sorted(

@@ -53,7 +53,7 @@ class Colmap:
         picture_size: longer side in pixels to which larger photographs are reduced for this purpose.
         features: largest number of features in a photograph.
         matching: which photographs are compared: ``exhaustive``: all; ``sequential``: those nearby in the order of
-            their names; ``auto``: all of up to 40, else nearby ones and a coarse selection of all.
+            their names; ``auto``: all of up to 40, otherwise nearby ones and a coarse selection of all.
         overlap: for ``sequential``, the number of photographs with which each is compared.
         region: which part of a photograph counts. ``all``: all of it; ``object``: only what the masks show; ``auto``:
             all, unless the room stands still while the object turns: then the masks or, without masks, what does not
@@ -169,8 +169,7 @@ class _Search:
         options.use_gpu, options.num_threads = False, _threads()
         options.max_image_size = self.settings.picture_size
         options.sift.max_num_features = self.settings.features
-        # Small photographs are also searched at twice their size: four times the work, but otherwise they have too few
-        # features.
+        # Small photographs are also searched at twice their size: four times the work, but they have few features.
         largest = max(max(self._reduced(shot)) for shot in self.album.shots)
         options.sift.first_octave = -1 if largest < LARGE else 0
         groups: dict[object, list[int]] = {}
