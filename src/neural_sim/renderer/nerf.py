@@ -111,7 +111,7 @@ class NerfRenderer:
     ]:
         """Render like ``render``, with the depth along the view axis in object radii.
 
-        The depth is where a pixel's ray has lost half of its light; it is 0 at opacities below 1/2, where none has.
+        The depth is where a pixel's ray has lost half of its light; it is 0 at opacities below 1/2, where no ray does.
         """
         image = render_views(
             field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
