@@ -77,7 +77,7 @@ class Target(ABC):
         return None
 
     def camera(self) -> PinholeCamera:
-        """Return the camera that took the images, in its own size.
+        """Return the camera that took the images, with its original image size.
 
         Raises:
             ValueError: the camera is unknown.

@@ -125,7 +125,7 @@ class CocoTarget(AnnotatedPhotographs):
 
     @cached_property
     def _roots(self) -> list[Path]:
-        """Folders to which file names may be relative: the one set, else the file's and those named ``images``."""
+        """Folders to which file names may be relative: the one set, or else the file's and those named ``images``."""
         here = self._folder
         return [here] if self.images is not None else [here, here / "images", here.parent / "images"]
 

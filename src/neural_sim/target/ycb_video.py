@@ -54,9 +54,9 @@ class YcbVideoTarget(PosedTarget):
 
     Args:
         val_list: the list in ``image_sets`` for validation, with one in ``every`` photographs of each scene; None:
-            ``train`` if present, else scenes without another part.
-        test_list: the list that is scored, all of it; None: ``keyframe`` if present, else scenes without another
-            part.
+            ``train`` if present, otherwise scenes that no other part has.
+        test_list: the list that is scored, all of it; None: ``keyframe`` if present, otherwise scenes that no other
+            part has.
 
     See ``PosedTarget`` for the other arguments.
     """
