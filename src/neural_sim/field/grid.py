@@ -141,8 +141,7 @@ class GridField(RadianceField):
         # The last row of corners points at the table's last row: empty space.
         self.corners = functional.pad(corners, (0, 0, 0, 1), value=len(coordinates))
         self.occupied, self.origin = occupied, occupancy.origin
-        # Kept as a number as well as in the saved buffer, because reading the buffer would make the host wait for the
-        # device.
+        # Also kept as a number, because reading the saved buffer would make the host wait for the device.
         self.edge, self.cell = float(cell), torch.tensor(cell, dtype=torch.float64)
         self.index, self.distance = occupancy.index, occupancy.distance
         self.coarse, self.coarse_radius = coarse_centres(occupancy)
