@@ -55,7 +55,7 @@ class AdjointSolver:
         rtol, max_steps: passed to the linear solver.
         retain_graph: keep the graph of the first gradient between products: faster, but with all chunks in memory.
         max_raises: limit on the increases of lambda after negative curvature was met (a fixed lambda is never raised).
-        sensitivity: also solve at 2 lambda, to measure the influence of the damping: up to ``max_steps`` more products.
+        sensitivity: also solve at 2 lambda, to measure the influence of the damping; costs about one more solve.
     """
 
     linear: LinearSolver = field(default_factory=ConjugateGradient)
@@ -97,7 +97,10 @@ class AdjointSolver:
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
     ) -> Solution:
-        """Solve at ``times`` lambda, starting from the damping's Krylov search or, without one, from ``x0``."""
+        """Solve with lambda multiplied by ``times``.
+
+        Starts from the damping's Krylov search or, without one, from ``x0``.
+        """
         searched = damped.search(times)
         start = x0 if searched is None else searched
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)

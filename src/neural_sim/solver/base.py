@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 
 class Status(enum.Enum):
-    """How a solve ended; the value says what to change."""
+    """How a solve ended; the value explains it and, where something can be done, says what."""
 
     CONVERGED = "residual below tolerance"
     APPROXIMATE = "a fixed approximation, not iterated to a tolerance: read the residual"
@@ -184,7 +184,10 @@ def _verified(claimed: Status, residual: float, rtol: float) -> Status:
 
 
 def _power_of_two(size: float) -> float:
-    """Find the power of two below ``size``. Scaling by it is exact, so relative residuals do not change."""
+    """Find the largest power of two that does not exceed ``size``.
+
+    Scaling by it is exact, so relative residuals do not change.
+    """
     return 2.0 ** (math.frexp(size)[1] - 1)
 
 
@@ -205,7 +208,7 @@ def _started(
     tolerance: float,
     max_steps: int,
 ) -> System:
-    """Start at the guess if its relative residual is below 1, the residual of zero; otherwise start at zero."""
+    """Start at the guess if it beats zero, whose relative residual is 1; otherwise start at zero."""
     cold = System(operator, rhs, torch.zeros_like(rhs), rhs, None, tolerance, max_steps)
     value = guess.value if isinstance(guess, Search) else guess
     if value is None or not bool(torch.isfinite(value).all()) or not bool(value.any()):

@@ -37,7 +37,7 @@ class ConjugateGradient(LinearSolver):
         for step in range(1, system.max_steps + 1):
             product = operator.measured(direction)
             # For positive definite A the cosine of p and Ap is at least 2 sqrt(kappa) / (kappa + 1) (Kantorovich),
-            # so one below machine epsilon is curvature that rounding cannot tell from zero.
+            # so a cosine below machine epsilon means curvature that rounding cannot tell from zero.
             if product.energy <= torch.finfo(rhs.dtype).eps * product.size * product.length:
                 return Iterate(best, Status.NEGATIVE_CURVATURE, step)
             alpha = energy / product.energy

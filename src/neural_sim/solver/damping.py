@@ -24,9 +24,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Damped:
-    """``value`` is lambda >= 0; ``spectrum`` is the undamped operator's, or None if it was not estimated.
+    """A chosen damping.
 
-    ``krylov`` is the space that the estimate searched, if that space starts from the right-hand side.
+    ``value`` is lambda >= 0, ``spectrum`` that of the undamped operator, or None if it was not estimated. ``krylov`` is
+    the space that the estimate searched, if that space starts from the right-hand side.
     """
 
     value: float
@@ -39,7 +40,7 @@ class Damped:
         return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
 
     def search(self, times: float = 1.0) -> Search | None:
-        """Solve at ``times`` lambda using the products that the estimate already computed; None without them."""
+        """Solve with lambda multiplied by ``times``, using only the estimate's products; None if there are none."""
         return None if self.krylov is None else self.krylov.search(times * self.value)
 
 
@@ -80,10 +81,10 @@ class LanczosDamping(Damping):
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
     last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
 
-    The Krylov space starts from the right-hand side, as conjugate gradients do. Since lambda exceeds minus its smallest
-    Ritz value, their first steps cannot break down. (From a random start, a few steps miss a detector's few negative
-    eigenvalues among many near zero: on a tiny RetinaNet, 12 steps gave -0.01 where lambda_min was -2.4.) If a longer
-    solve still meets negative curvature, lambda is raised until it exceeds that too.
+    The Krylov space starts from the right-hand side, as conjugate gradients do. Since lambda exceeds the negated
+    smallest Ritz value of that space, the first CG steps cannot break down. (From a random start, a few steps miss a
+    detector's few negative eigenvalues among many near zero: on a tiny RetinaNet, 12 steps gave -0.01 where lambda_min
+    was -2.4.) If a longer solve still meets negative curvature, lambda is raised until it exceeds that too.
     """
 
     margin: Positive = 0.25

@@ -115,8 +115,8 @@ class HessianOperator:
 def difference_length(point: Float[Tensor, "n"], vector: Float[Tensor, "n"]) -> float:
     """Choose h for the difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
 
-    The truncation error (h |vector|)^2 and the rounding error eps / (h |vector|) balance at eps^(1/3), relative to the
-    size of the point.
+    The truncation error (h |vector|)^2 and the rounding error eps / (h |vector|) balance at eps^(1/3), relative to 1
+    plus the root mean square of the point.
     """
     size = norm(vector)
     reach = torch.finfo(vector.dtype).eps ** (1 / 3) * (1.0 + norm(point) / point.numel() ** 0.5)

@@ -82,7 +82,7 @@ class Spectrum:
 
 
 def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
-    """Find extreme Ritz values of a symmetric operator by at most ``steps`` products from a non-zero ``start``.
+    """Find extreme Ritz values of a symmetric operator with at most ``steps`` products, from a non-zero ``start``.
 
     Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue among those whose
     eigenvectors contribute to the start vector. Memory: ``steps`` vectors.

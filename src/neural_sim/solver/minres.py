@@ -20,8 +20,8 @@ from neural_sim.solver.operator import Watched, dot, norm
 class MinimumResidual(LinearSolver):
     """The minimum residual method (MINRES), for any symmetric operator.
 
-    The residual falls monotonically. On an inconsistent singular system it ends at a least-squares solution and reports
-    that. ``restart_gain`` as in ``ConjugateGradient``.
+    The residual falls monotonically. On an inconsistent singular system the method ends at a least-squares solution and
+    says so. ``restart_gain`` as in ``ConjugateGradient``.
     """
 
     restart_gain: RestartGain = 0.5
