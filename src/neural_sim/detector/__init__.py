@@ -1,1 +1,1 @@
-"""RetinaNet as pure functions of a parameter dictionary."""
+"""Detectors (RetinaNet, FCOS, a classifier) as pure functions of a parameter dictionary; training, scores, files."""

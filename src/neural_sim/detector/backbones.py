@@ -25,12 +25,18 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def group_norm(channels: int) -> nn.GroupNorm:
-    """Normalise in groups of 8 channels, independently of the batch: an image's loss depends on no other image."""
+    """Build a normalisation over groups of 8 channels.
+
+    Unlike batch normalisation, it keeps an image's loss independent of the other images.
+    """
     return nn.GroupNorm(max(1, channels // 8), channels)
 
 
 def set_activation(module: nn.Module, activation: str) -> None:
-    """Replace every ReLU in ``module`` by ``activation``, never in place: function transforms replay the graph."""
+    """Replace every ReLU in ``module`` by an ``activation`` that does not work in place.
+
+    Function transforms replay the graph, so no input may be overwritten.
+    """
     for name, child in module.named_children():
         if isinstance(child, nn.ReLU):
             setattr(module, name, ACTIVATIONS[activation]())
@@ -75,8 +81,9 @@ PLANS = {
 class Stages(nn.Module):
     """A sequence of modules, some of which end a stage; the maps at ``strides`` are the backbone's output.
 
-    ``children`` are registered in the attribute ``under``, which becomes part of their parameter names. ``ends`` maps
-    each module that ends a stage to its stride, from fine to coarse. ``channels`` maps strides to numbers of channels.
+    ``children`` are registered under the attribute name ``under``, which becomes part of their parameter names.
+    ``ends`` maps each module that ends a stage to its stride, from fine to coarse. ``channels`` maps strides to numbers
+    of channels.
     """
 
     def __init__(

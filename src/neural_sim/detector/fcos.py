@@ -45,8 +45,8 @@ class FcosHead(nn.Module):
         )
         self.regression_head = FCOSRegressionHead(settings.channels, 1, settings.convs, norm_layer=norm)
         if settings.normalisation == "group":
-            # Normalisation cancels a shift that all channels of a group share, so that its gradient is mere rounding
-            # error. AdamW would divide by that error, and the derivative through a training would magnify it.
+            # Normalisation cancels a shift shared by all channels of a group, so the gradient along that shift is mere
+            # rounding error. AdamW would divide by that error, and the derivative through a training would magnify it.
             for branch in (self.classification_head, self.regression_head):
                 for layer in branch.conv:
                     if isinstance(layer, nn.Conv2d):
@@ -65,7 +65,9 @@ class FcosHead(nn.Module):
 
 @validated
 class Fcos(PyramidDetector):
-    """An FCOS for images of one size; holds its shape, its points and its loss, never its parameters.
+    """An FCOS for images of one size.
+
+    It holds the network's shape, the points and the loss, but no parameters.
 
     Args:
         points: which points are assigned to which object.
@@ -145,9 +147,9 @@ class Fcos(PyramidDetector):
 
 
 def generalised_iou(ours: Float[Tensor, "*n 4"], theirs: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
-    """Compute the generalised IoU of boxes around a common point, given as its distances to their sides.
+    """Compute the generalised IoU of pairs of boxes that contain a common point.
 
-    The boxes ``theirs`` must have a positive area.
+    A box is given by the point's distances to its sides. The boxes ``theirs`` must have a positive area.
     """
     least, most = torch.minimum(ours, theirs), torch.maximum(ours, theirs)
     inside, hull, area, other = (_area(part) for part in (least, most, ours, theirs))

@@ -1,6 +1,6 @@
 """Targets of anchors and points, and the losses of their predictions.
 
-Losses are elementwise and smooth, so that their Hessians predict the effect of a finite step.
+The default losses are smooth, so their Hessians predict the effect of a finite step (that of ``l1`` does not).
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def assign_anchors(
     """Match anchors to boxes like torchvision's ``Matcher`` with low-quality matches, but all images at once.
 
     Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding. An anchor takes the box it overlaps
-    most if that overlap reaches ``foreground_iou``, or if no anchor overlaps that box more; it is ignored
-    if its overlap is between the thresholds.
+    most if that overlap reaches ``foreground_iou``, or if the anchor is the best one of any box (not necessarily of
+    that one); otherwise it is ignored if its overlap is between the thresholds.
 
     Raises:
         ValueError: a box that is not padding has no area.
@@ -152,8 +152,8 @@ def focal_loss(
 def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Float[Tensor, "*shape"]:
     """Compute the loss of each element's error in an encoded box coordinate.
 
-    ``pseudo_huber`` is delta (sqrt(1 + (r / delta)^2) - 1): quadratic within ``delta``, of slope 1
-    for large errors like ``l1``, smooth everywhere. ``l1`` is torchvision's default and has no curvature.
+    ``pseudo_huber`` is delta (sqrt(1 + (r / delta)^2) - 1), smooth everywhere: quadratic within ``delta``, and with
+    slope 1, as ``l1``, for large errors. ``l1`` is torchvision's default and has no curvature.
     """
     if kind == "l1":
         return residual.abs()

@@ -161,7 +161,7 @@ def _average_precision(
     values = [float("nan")] * classes
     present = {int(label) for image in truth for label in image["labels"]}
     for label, value in zip(result["classes"].reshape(-1), result["map_per_class"].reshape(-1), strict=True):
-        # COCO's -1 stands for "no ground truth"; a class only predicted is absent as well.
+        # COCO's -1 stands for "no ground truth"; a class that is only predicted counts as absent, too.
         if int(label) in present:
             values[int(label)] = float(value)
     return values

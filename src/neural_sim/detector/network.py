@@ -84,7 +84,10 @@ class Predictor(nn.Module):
 def build_predictor(
     in_channels: list[int], levels: int, head: nn.Module, settings: Head, activation: str
 ) -> Predictor:
-    """Build a pyramid with ``levels`` levels, more than ``in_channels`` if some are coarser, and its head."""
+    """Build a pyramid of ``levels`` levels, with ``head`` on top of it.
+
+    Levels in excess of ``in_channels`` are coarser than the backbone's maps.
+    """
     channels, norm = settings.channels, group_norm if settings.normalisation == "group" else None
     coarser = levels - len(in_channels)
     extra = CoarserLevels(in_channels[-1], channels, coarser, activation) if coarser else None

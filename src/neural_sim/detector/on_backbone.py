@@ -77,7 +77,8 @@ class BackboneDetector(Detector):
     def in_loop(self, layers: int | None) -> BackboneDetector:
         """Return the detector as the psi loop trains it, with the last ``layers`` stages of its backbone.
 
-        None means one stage of the small backbones, and none of a ResNet, whose stages have millions of parameters.
+        By default (None), one stage of the small backbones, and no stage of a ResNet, whose stages have millions of
+        parameters.
 
         Raises:
             ValueError: the backbone has published weights, whose normalisation is frozen; or ``layers`` is negative or
@@ -183,7 +184,7 @@ class PyramidDetector(BackboneDetector):
     See ``BackboneDetector`` for the other arguments.
 
     Raises:
-        ValueError: the backbone does not have these strides; the message has the key and the value.
+        ValueError: the backbone does not have these strides; the message names the key and the value.
     """
 
     def __init__(

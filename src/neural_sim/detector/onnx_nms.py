@@ -15,7 +15,8 @@ INPUTS = ("anchor_boxes", "anchor_scores")
 def with_nms(model: Any, saved: SavedDetector) -> Any:
     """Append the steps of ``Detector.predict`` to ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``.
 
-    It takes the best candidates of each level, suppresses within each class, and keeps the best ``limit`` of an image.
+    The appended steps take the best candidates of each level, suppress within each class, and keep the best ``limit``
+    of an image.
     """
     import onnx
 

@@ -18,10 +18,10 @@ State = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class AdamW:
-    """Adam with decoupled weight decay (Loshchilov and Hutter 2019, Algorithm 2), as ``torch.optim.AdamW`` steps.
+    """Adam with decoupled weight decay (Loshchilov and Hutter 2019, Algorithm 2).
 
-    ``weight_decay`` is one number, or one for each entry of theta. The buffers are the two moments. ``floor`` is a
-    lower bound of the denominator, entry by entry.
+    It steps as ``torch.optim.AdamW`` does. ``weight_decay`` is one number, or one for each entry of theta. The buffers
+    are the two moments. ``floor`` is a lower bound of the denominator, entry by entry.
     """
 
     weight_decay: float | Float[Tensor, "n"] = 1e-2

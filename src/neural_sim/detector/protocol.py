@@ -23,7 +23,7 @@ Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors cod
 
 
 def score_of(make: Callable[..., Detector]) -> Score:
-    """Return the score of the detectors that a constructor from ``conf/detector`` makes."""
+    """Return the kind of score by which the detectors of a constructor from ``conf/detector`` are judged."""
     while isinstance(make, functools.partial):
         make = make.func
     return getattr(make, "score", "AP")

@@ -93,7 +93,7 @@ class Real:
         return replace(self, count=self.number(available), fraction=None, fewer="refuse")
 
     def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
-        """Choose the photographs that train: the first of a random order that depends on ``seed`` alone.
+        """Choose the photographs to train on: the first ones in a random order that depends only on ``seed``.
 
         Raises:
             ValueError: as for ``number``.

@@ -21,9 +21,10 @@ from neural_sim.ranges import NonNegative, PositiveInt, validated
 
 @validated
 class RetinaNet(PyramidDetector):
-    """A RetinaNet for images of one size; holds its shape, its anchors and its loss, never its parameters.
+    """A RetinaNet for images of one size.
 
-    See ``PyramidDetector`` for the arguments, which it checks.
+    It holds the network's shape, the anchors and the loss, but no parameters. See ``PyramidDetector`` for the
+    arguments, which it checks.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class RetinaNet(PyramidDetector):
         return assign_anchors(self.anchors.to(boxes), boxes, labels, *self._overlaps)
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Sum each image's focal and box losses over anchors, divided by the number of foreground anchors."""
+        """Sum each image's focal and box losses over anchors, and divide by the number of foreground anchors."""
         (logits, deltas), costs = outputs, self._losses
         labels = targets.labels
         classes = torch.arange(self.num_classes, device=labels.device)

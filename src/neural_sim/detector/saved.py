@@ -1,7 +1,7 @@
 """Save and load a trained detector as two files, and detect objects in photographs with it.
 
-``model.safetensors`` has its parameters. ``model.json`` has everything else that is needed to build and use it: its
-class and settings, class names, image size, normalisation, camera.
+``model.safetensors`` holds its parameters, ``model.json`` everything else that is needed to build and use it: its class
+and settings, class names, image size, normalisation, camera.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class SavedDetector:
 
         Raises:
             ValueError: files are missing, unreadable, of another format or version, do not belong together, or have
-                parameters that do not fit the detector. The message has the file, the key and what is wanted.
+                parameters that do not fit the detector. The message names the file, the key and what is wanted.
         """
         folder = path if path.is_dir() else path.parent
         named = path.is_file() and path.name in (WEIGHTS, DOCUMENT)
@@ -272,15 +272,13 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
 def rebuilt(
     description: Mapping[str, Any], file: Path, outside: str | None = None
 ) -> Callable[..., Detector]:
-    """Rebuild the constructor that ``described`` described, a class that must derive from ``Detector``.
+    """Rebuild a constructor from the output of ``described``; its class must derive from ``Detector``.
 
-    No code runs except that class's own.
-
-    For ``outside`` see ``SavedDetector.load``.
+    No code runs except that of the class's module, which is imported. For ``outside`` see ``SavedDetector.load``.
 
     Raises:
-        ValueError: a class cannot be imported or is not a detector, or it refuses or does not have a setting. The
-            message has the file and the key.
+        ValueError: the class cannot be imported or is not a detector, or a setting is unknown or refused. The message
+            names the file and the key.
     """
     kind = _detector_class(description.get("class"), f"{file}: detector.class", outside)
     where = f"{file}: detector.settings"

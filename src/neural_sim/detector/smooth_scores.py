@@ -3,7 +3,8 @@
 Average precision: detections come from the forward pass, after non-maximum suppression. Their anchors are fixed; their
 scores and boxes are differentiated. Two step functions of COCO's definition become sigmoids: whether a detection is a
 true positive (a sigmoid of its overlap), and whether it ranks below another (a sigmoid of the difference of logits;
-Brown et al. 2020, Smooth-AP, Eq. 6). Top-1 accuracy: whether the right class is best becomes that class's probability.
+Brown et al. 2020, Smooth-AP, Eq. 6). For top-1 accuracy, the step function "the right class is best" becomes that
+class's probability.
 """
 
 from __future__ import annotations
@@ -60,7 +61,10 @@ class SmoothAP:
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages
     ) -> Float[Tensor, "classes images"]:
-        """Compute each image's contribution to every class's AP, the sum of a row; nan for a class without boxes."""
+        """Compute each image's contribution to every class's AP.
+
+        A row sums to the class's AP; it is nan for a class without boxes.
+        """
         rows = []
         for detections in ranked(detector, outputs, images, self.per_class):
             row = detections.logits.new_zeros(len(images))
@@ -157,7 +161,10 @@ class SmoothAccuracy:
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages
     ) -> Float[Tensor, "classes images"]:
-        """Compute each image's part of its class's accuracy, the sum of a row; nan for a class without images."""
+        """Compute each image's contribution to its class's accuracy.
+
+        A row sums to the class's accuracy; it is nan for a class without images.
+        """
         logits = outputs[0][:, 0]
         labels = class_of(images.labels).to(logits.device)
         probabilities = (logits / self.temperature).softmax(-1)

@@ -31,10 +31,10 @@ from neural_sim.types import LabelledImages
 class Training:
     """Training settings that detectors share, whichever method chose their images.
 
-    ``image_size`` is the side of the square images in pixels. ``warm_start`` is the distribution of the warm start's
-    images: all parameters uniform, or the initial psi. ``warm_epochs`` are the epochs of the warm start,
-    ``cold_epochs`` those of the detectors that are scored. ``real`` says how training uses labelled photographs. For
-    the rest see ``Optimisation``.
+    ``image_size`` is the side of the square images in pixels. ``images_per_object`` is the number of training images of
+    each object. ``warm_start`` is the distribution of the warm start's images: all parameters uniform, or the initial
+    psi. ``warm_epochs`` are the epochs of the warm start, ``cold_epochs`` those of the detectors that are scored.
+    ``real`` says how training uses labelled photographs. For the rest see ``Optimisation``.
 
     Raises:
         ValueError: batches of one image cannot mix photographs with synthetic images.
@@ -109,7 +109,7 @@ class Batches:
             yield tuple(x[index] for x in self.inputs), self.targets.select(index)
 
     def _epoch(self) -> Iterable[Int[Tensor, "batch"]]:
-        # Rows are moved to the images' device once an epoch.
+        # One transfer per epoch, so that the host does not wait for the device at every batch.
         device = self.targets.labels.device
         if self._sampled is not None:
             return torch.stack(list(itertools.islice(self._sampled, self._steps))).to(device)
@@ -141,8 +141,8 @@ def train_detector(
         sampling: how batches are drawn from ``images`` (None: each image once in every epoch).
 
     Returns:
-        New, detached parameters, all of them (frozen ones are the given tensors), and the history, whose losses
-        exclude the proximal term.
+        All parameters (new, detached tensors for the trained ones, the given tensors for the frozen ones), and the
+        history, whose losses exclude the proximal term.
 
     Raises:
         ValueError: there are no images, the recording does not fit its memory limit, or the loss stops being finite.
