@@ -61,7 +61,7 @@ class Target(ABC):
         Args:
             objects: the run's objects by name; labels are positions in it.
             distribution: the scene parameters; the bins of boxes are those of its first factor with bins.
-            camera: gives the size of the images; a target that renders uses all of it.
+            camera: gives the size of the images; a target that renders also uses its field of view and principal point.
             synthesizer: composes rendered views with backgrounds, as for training images.
             seed: seed of all random choices.
 
@@ -143,9 +143,10 @@ class Photographs(Target):
 
 @dataclass(frozen=True, kw_only=True)
 class AnnotatedPhotographs(Photographs):
-    """Photographs with labels of their own, divided by groups and by their pixels: equal ones lie in one part.
+    """Photographs with labels of their own, split by group.
 
-    A subclass defines ``source``, ``files`` and ``photographs``. For the arguments see ``Photographs``.
+    Photographs with equal pixels stay in the same part. A subclass defines ``source``, ``files`` and ``photographs``.
+    For the arguments see ``Photographs``.
     """
 
     @property

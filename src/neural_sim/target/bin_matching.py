@@ -19,11 +19,12 @@ def matching(
     generator: torch.Generator,
     where: str,
 ) -> Int[Tensor, "chosen"]:
-    """Choose from ``rows`` photographs that follow ``targets``, the distributions over bins by object in label order.
+    """Choose those photographs of ``rows`` whose bins follow ``targets``.
 
-    For every object, as many photographs are chosen as its distribution allows, each at most once and at random within
-    a bin. The number in a bin is that of the distribution, rounded up or down. Photographs without a box that has a bin
-    are left out, and so are objects without photographs.
+    ``targets`` has each object's distribution over bins, in label order. For every object, as many photographs are
+    chosen as its distribution allows, each at most once and at random within a bin. The number in a bin is that of the
+    distribution, rounded up or down. Photographs without a box that has a bin are left out, and so are objects without
+    photographs.
 
     Raises:
         ValueError: a photograph shows several objects or bins, or none shows a bin that the distribution needs; the

@@ -1,7 +1,7 @@
 """Scenes of a BOP benchmark data set: https://github.com/thodan/bop_toolkit, docs/bop_datasets_format.md.
 
 ``<split>/<scene>/{scene_gt,scene_gt_info,scene_camera}.json`` next to ``rgb`` (or ``gray``), ``depth`` and
-``mask_visib``; ``models/models_info.json``; ``test_targets_bop19.json``. Millimetres, OpenCV axes.
+``mask_visib``; ``models/models_info.json``; ``test_targets_bop19.json``. Lengths are in millimetres, axes as in OpenCV.
 """
 
 from __future__ import annotations

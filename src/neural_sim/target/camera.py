@@ -32,12 +32,12 @@ class CameraSource(Protocol):
 @validated
 @dataclass(frozen=True)
 class GivenCamera(CameraSource):
-    """A camera by its field of view or by its OpenCV camera matrix.
+    """A camera given by its field of view or by its OpenCV camera matrix.
 
     Args:
-        width, height: size in pixels; null, both: a square image of the training's size.
-        field_of_view_deg: vertical field of view, for square pixels and a principal point in the image's centre; null,
-            without a focal length: that of the objects' views.
+        width, height: size in pixels; both null: a square image of the training's size.
+        field_of_view_deg: vertical field of view, for square pixels and a principal point in the image's centre; null
+            and no focal length given: that of the objects' views.
         fx, fy: focal lengths in pixels; ``fy`` null: square pixels.
         cx, cy: principal point in pixels from the centre of the upper left pixel, as in OpenCV; null: the
             image's centre, (width - 1) / 2 and (height - 1) / 2.

@@ -37,10 +37,10 @@ _log = logging.getLogger(__name__)
 @validated
 @dataclass(frozen=True)
 class CocoTarget(AnnotatedPhotographs):
-    """Photographs with a COCO ``annotations`` file. Annotations of crowds are left out, boxes are clipped.
+    """Photographs with a COCO ``annotations`` file.
 
-    ``split_by`` may also be ``attribute:<name>``, an attribute of the file's image entries. If there are more images
-    than ``limit``, the first by id are taken.
+    Crowd annotations are left out, and boxes are clipped to the image. ``split_by`` may also be ``attribute:<name>``,
+    an attribute of the file's image entries. If there are more images than ``limit``, the first by id are taken.
 
     Args:
         annotations: the JSON file.
@@ -125,7 +125,11 @@ class CocoTarget(AnnotatedPhotographs):
 
     @cached_property
     def _roots(self) -> list[Path]:
-        """Folders to which file names may be relative: the one set, or else the file's and those named ``images``."""
+        """Folders to which file names may be relative.
+
+        ``images`` if it is set; otherwise the annotation file's folder and a folder named ``images`` in it or next to
+        it.
+        """
         here = self._folder
         return [here] if self.images is not None else [here, here / "images", here.parent / "images"]
 
@@ -134,7 +138,7 @@ class CocoTarget(AnnotatedPhotographs):
         return Counter(_last(entry) for entry in self._coco.images)
 
     def _path(self, entry: Entry) -> Path:
-        """Return an image's file: by its name as written, with ``/``, or in Unicode's other form.
+        """Find an image's file by its name: as written, with ``/`` as separator, or in NFC or NFD.
 
         If there is no such file (the name may have other folders, or be a URL), it is the file with the last part of
         the name, unless another image has the same last part.

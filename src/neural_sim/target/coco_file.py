@@ -35,7 +35,7 @@ COCO_KIND = ("category", "categories")
 
 
 def is_number(value: object) -> bool:
-    """Tell whether a value of JSON is a finite number of pixels."""
+    """Tell whether a JSON value is a finite number within the range of pixel coordinates."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
 
 
@@ -110,7 +110,7 @@ def refuse_size(entry: Entry, header: Header, where: str) -> None:
 
 
 def _upright(item: Entry) -> Entry:
-    """Return an annotation with the upright box around its box, if that is rotated as CVAT writes it."""
+    """Return an annotation, with the upright box around its box if CVAT's attribute ``rotation`` turns that."""
     attributes = item.get("attributes")
     angle = attributes.get("rotation") if isinstance(attributes, dict) else None
     if not is_number(angle) or not angle or item.get("segmentation"):  # a polygon's box is upright
@@ -133,8 +133,8 @@ class CocoFile:
     def read(cls, path: Path) -> CocoFile:
         """Read and check a file.
 
-        The log counts annotations of images that the file does not list, crowds, boxes without a side, repeated boxes,
-        and rotated boxes, which are replaced by the upright boxes around them.
+        The log counts annotations of images that the file does not list, crowds, boxes of zero width or height,
+        repeated boxes, and rotated boxes, which are replaced by the upright boxes around them.
 
         Raises:
             ValueError: the file is not JSON; a section or a key is missing; an id, a name or a box is invalid; an id or

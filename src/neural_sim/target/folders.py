@@ -25,8 +25,8 @@ from neural_sim.target.split import evenly, groups_of
 class FolderTarget(AnnotatedPhotographs):
     """Photographs ``<root>/<class>/...`` at any depth. They have no boxes: an image's box is the whole photograph.
 
-    ``split_by`` is searched in ``<class>/<file>``. If a class has more photographs than ``limit``, evenly spaced ones
-    by name are taken. With ``unmatched=leave_out`` and ``classes``, every folder that is not listed is skipped
+    ``split_by`` is searched for in ``<class>/<file>``. If a class has more photographs than ``limit``, evenly spaced
+    ones by name are taken. With ``unmatched=leave_out`` and ``classes``, every folder that is not listed is skipped
     unread.
 
     Args:

@@ -47,8 +47,8 @@ class Mismatch:
 def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "_"]]:
     """Return the compared statistics: a value for each image, or for each box if the name says so.
 
-    Sizes and offsets are fractions of the image's size (of the root of its area, and of half its diagonal); brightness
-    and contrast are of sRGB values in [0, 1], noise and sharpness of luma.
+    Sizes and offsets are fractions of the image's size (of the root of its area, and of half its diagonal); brightness,
+    contrast, noise and sharpness are of luma, saturation is of the sRGB channels; luma and channels are in [0, 1].
     """
     height, width = images.images.shape[-2:]
     present = images.present
@@ -130,7 +130,7 @@ def matching_settings(
         level = 0.5 * (low + high)
         settings["synthesis.sensor.noise"] = f"[{low:.2g},{high:.2g}]"
     if "sharpness" in differs and differs["sharpness"].larger < 0.5:
-        # One blur: the sharpness of images also varies with what they show.
+        # A single blur instead of a range, because the sharpness of images also varies with what they show.
         blur = _blur_to(mine["sharpness"].median(), synthesised, largest_blur, level)
         settings["synthesis.sensor.blur"] = f"[{blur:.2g},{blur:.2g}]"
     if "objects" in differs:

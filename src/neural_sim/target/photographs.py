@@ -228,7 +228,10 @@ def _placed(photograph: Photograph, placing: Letterbox, minimum_side: float) -> 
 
 
 def padded(images: Float[Tensor, "n 3 h w"], kept: Sequence[Boxes]) -> LabelledImages:
-    """Label images; boxes are padded to the longest list among them, bins are by box if some image has any."""
+    """Combine images and their boxes into a labelled set.
+
+    Boxes are padded to the longest list among them; bins are by box if some image has any.
+    """
     most = max([1, *(len(one.labels) for one in kept)])
     boxes = torch.zeros(len(kept), most, 4)
     labels, bins = (torch.full((len(kept), most), -1) for _ in range(2))

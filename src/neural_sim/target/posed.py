@@ -35,7 +35,7 @@ Radii = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class PosedTarget(Photographs):
-    """Photographs with poses, which are divided by scenes before any of them is read.
+    """Photographs with poses. They are divided before any is read, by scene unless ``split_by`` is given.
 
     A subclass lists the photographs (``listed``) and provides their ``reader``. ``split_by`` is searched for in
     ``<scene>/<number>``; None: the photographs of a scene belong together. If a part has more photographs than

@@ -31,7 +31,8 @@ class RenderedTarget(Target):
         val_per_object: number of images of each object for validation, on which psi is learned.
         test_per_object: number of images of each object to score.
         test_per_biased_object: the same for objects that some parameter's ``biased`` names, whose scores are compared.
-        train_per_object: number of images that replace labelled photographs in training (``training.real``); 0: none.
+        train_per_object: number of images of each object that stand in for labelled photographs in training
+            (``training.real``); 0: none.
     """
 
     renders: ClassVar[bool] = True
@@ -75,7 +76,7 @@ class RenderedTarget(Target):
         return parts
 
     def _count(self, part: str, biased: bool) -> int:
-        """Return the number of an object's images; if images show several objects, of those drawn for this one."""
+        """Return the number of images drawn for an object; if images show several, others may show it, too."""
         if part != "test":
             return self.val_per_object if part == "val" else self.train_per_object
         return self.test_per_biased_object if biased else self.test_per_object

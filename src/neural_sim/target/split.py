@@ -163,8 +163,8 @@ def groups_of(
     Args:
         names: the photographs' file names.
         split_by: ``attribute:<name>``: the group is that attribute of the photograph's entry; otherwise a regular
-            expression that is searched in the name: the group is its first capture group, or the whole match if it has
-            none.
+            expression that is searched for in the name: the group is its first capture group, or the whole match if it
+            has none.
         source: origin of the photographs, for messages.
         entries: the photographs' entries; None: there are none, so that a regular expression is needed.
 
@@ -255,7 +255,7 @@ def split(
 
 
 def nearest(sizes: Sequence[int], wanted: int) -> set[int]:
-    """Choose some of the ``sizes``, not none or all, such that their sum is nearest to ``wanted``.
+    """Choose some but not all of the ``sizes``, such that their sum is nearest to ``wanted``.
 
     Subset sum by dynamic programming: bit s of ``reached`` says whether the sizes so far can add up to s;
     ``last[s]`` is the position that first made it possible.

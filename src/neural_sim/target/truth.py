@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Truth:
-    """The COCO file ``path``, with a detector's classes and the entries of ``photos``.
+    """Ground truth from the COCO file ``path``, matched to a detector's classes and to ``photos``.
 
     ``categories`` maps the file's category names to class names, null to leave one out. A photograph's entry is the one
     whose ``file_name`` is its path below the photographs' folder or the file's folder, or else the only one with its

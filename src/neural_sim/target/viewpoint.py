@@ -46,9 +46,9 @@ def viewpoint_of(
     position in the image does not affect the angles.
 
     (phi, rho, roll) and (-phi, rho + pi, roll + pi) are the same camera. The triple within the ranges is taken, or the
-    one that misses them by less; if they are equal in this, for instance because both ranges are full circles, the one
-    with the smaller roll. Angles are within half a turn of the middle of their range. At the poles, where rho and roll
-    have the same effect, rho is 0 or pi.
+    one that misses them by less; if both miss by the same amount, for instance because both ranges are full circles,
+    the one with the smaller absolute roll. Angles are within half a turn of the middle of their range. At the poles,
+    where rho and roll have the same effect, rho is 0 or pi.
 
     Args:
         object_to_camera: rigid, OpenCV axes (x right, y down, view along +z); the object stands upright along its +z.

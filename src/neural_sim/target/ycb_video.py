@@ -269,10 +269,10 @@ def _check_elements(data: bytes, order: str) -> None:
 
 
 def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read arrays of a MATLAB file, of version 5 or of version 7.3, which is HDF5, with MATLAB's shapes.
+    """Read arrays from a MATLAB file, version 5 or 7.3 (HDF5); their shapes are MATLAB's.
 
-    Other arrays in the file are not read. MATLAB stores arrays column by column, which HDF5 reads as the transpose. It
-    drops trailing dimensions of size 1: the poses of one object are 3 x 4, those of two 3 x 4 x 2.
+    Other arrays in the file are not read. MATLAB stores arrays column by column, which HDF5 reads as the transpose.
+    MATLAB drops trailing dimensions of size 1: the poses of one object are 3 x 4, those of two 3 x 4 x 2.
 
     Raises:
         ValueError: the file is missing, is not a MATLAB file, or lacks a name.
@@ -292,7 +292,7 @@ def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
             data = path.read_bytes()
             _check_elements(data[128:], "<" if data[126:128] == b"IM" else ">")
             found = scipy.io.loadmat(path, variable_names=list(names))
-    except Exception as error:  # both readers raise whatever damaged numbers cause
+    except Exception as error:  # on damaged files, both readers raise arbitrary exceptions
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}: not a readable MATLAB file ({reason})") from error
     lacking = [name for name in names if name not in found]
