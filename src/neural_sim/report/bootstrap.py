@@ -51,8 +51,8 @@ def match(
 ) -> Outcomes:
     """Match the predictions of one class with its labels, as the basis of the class's score.
 
-    For AP, detections are matched by COCO's rules: in each image from the best on, each to the unmatched box with
-    which it overlaps most.
+    For AP, detections are matched by COCO's rules: in each image from the best down, each to the unmatched box that it
+    overlaps most.
 
     Args:
         predictions: the predictions on every image.

@@ -1,6 +1,6 @@
 """A page on which the user drags the box around a photographed object and sees it in the photographs.
 
-Needs viser (the extra ``viewer``).
+The page needs viser (the extra ``viewer``).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def first_box(capture: Capture) -> Corners:
 
 
 def drawn(frame: Frame, box: Corners) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the edges of a box into a photograph; an edge with an end behind the camera is left out."""
+    """Draw the edges of a box onto a photograph; an edge with an end behind the camera is left out."""
     picture = read_picture(frame.image, upright=False).convert("RGB")
     picture.thumbnail((SHOWN, SHOWN))
     lens = frame.lens.resized(*picture.size)

@@ -78,7 +78,7 @@ class Comparison:
 
     @property
     def timed(self) -> bool:
-        """Whether the same holds for differences at fewer seconds than a run took."""
+        """Whether intervals are over seeds and valid at any time, not only at the end of the runs."""
         return self.several and not self.only_at_end
 
     @property

@@ -61,10 +61,10 @@ def check_database(database: Path) -> None:
 
 
 def upgrade(database: Path) -> None:
-    """Upgrade a database of an older MLflow to the installed version's schema; it is copied first, and logged.
+    """Upgrade a database of an older MLflow to the installed version's schema.
 
-    MLflow itself either upgrades without a copy or refuses the database. A schema that the installed version does not
-    know stays as it is.
+    The database is copied first, and a warning is logged. MLflow itself either upgrades without a copy or refuses the
+    database. A schema that the installed version does not know stays as it is.
     """
     before = _schema_of(database)
     if before is None:

@@ -106,7 +106,10 @@ def psi_panel(axes: Any, learned: Learned) -> None:
 
 
 def shown_panel(axes: Any, one: FactorEstimate) -> None:
-    """Draw the estimate from the target's boxes with its intervals, and psi, by bin; bins that look the same as one."""
+    """Draw the estimate from the target's boxes with its intervals, and psi, by bin.
+
+    Bins that look the same are drawn as one.
+    """
     groups = one.groups
     start, p, low, high = (
         merged(torch.tensor(values), groups).numpy() for values in (one.start, one.p, one.low, one.high)

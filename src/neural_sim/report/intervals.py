@@ -4,8 +4,8 @@ A score varies between seeds (objects' fields, training and test images, initial
 A few seeds say little about their own scatter, so intervals use Student's quantile; resampling the seeds instead would
 cover the truth in only 81, 86 and 92 of 100 cases with 2, 3 and 5 seeds. If all seeds share the test images, as
 trainings repeated on one target do, the test images' part of the variance does not shrink with the number of seeds. It
-is therefore added, as squares. If each seed has test images of its own, the scatter between seeds already includes that
-part, and intervals are slightly too wide: they cover 98 of 100.
+is therefore added in quadrature. If each seed has test images of its own, the scatter between seeds already includes
+that part, and intervals are slightly too wide: they cover 98 of 100.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def over_seeds_and_images(
 
 
 def over_images(value: float, resampled: Float[np.ndarray, "draws"]) -> Estimate:
-    """Return a value with the 2.5 % and 97.5 % quantiles of its resampled values, without nan."""
+    """Return a value with the 2.5 % and 97.5 % quantiles of its resampled values, ignoring nan."""
     low, high = np.nanquantile(resampled, [0.025, 0.975])
     return Estimate(value, float(low), float(high))
 
@@ -123,7 +123,7 @@ def ratio(numerator: Sample, denominator: Sample) -> Estimate:
     square = d * d - dd
     if square <= 0.0:
         return Estimate(value)
-    # (n - r d)^2 <= nn - 2 r nd + r^2 dd, with two roots if the factor of r^2 is positive.
+    # (n - r d)^2 <= nn - 2 r nd + r^2 dd, with two roots if the coefficient of r^2 is positive.
     root = math.sqrt(max((n * d - nd) ** 2 - square * (n * n - nn), 0.0))
     return Estimate(value, (n * d - nd - root) / square, (n * d - nd + root) / square)
 
@@ -134,7 +134,7 @@ def _quantile(seeds: int) -> float:
 
 
 def _covariance(a: Sample, b: Sample) -> float:
-    """Return the covariance of two means, its parts times their squared quantiles.
+    """Return the covariance of two means, each part multiplied by its squared quantile.
 
     For a = b, this is the squared half-width of the interval.
     """

@@ -1,4 +1,4 @@
-"""The files of a run's final detector: for this project, as ONNX, and as a model of MLflow's."""
+"""The files of a run's final detector: for this project, as ONNX, and as an MLflow model."""
 
 from __future__ import annotations
 

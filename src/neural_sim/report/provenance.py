@@ -15,7 +15,7 @@ import torch
 
 PACKAGE = Path(__file__).parents[1]
 SMALLEST = "smoke"
-"""The choice of ``scale`` that tries that everything runs."""
+"""The choice of ``scale`` that only checks that everything runs."""
 
 
 @cache
@@ -51,7 +51,10 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
 
 
 def gpu(device: torch.device | None) -> dict[str, Any]:
-    """Return a GPU's name, its memory, and the peak memory of tensors since the last reset; only the type of a CPU."""
+    """Return a GPU's name, its memory, and the peak memory of tensors since the last reset.
+
+    For a CPU, return only the device type.
+    """
     if device is None or device.type != "cuda":
         return {} if device is None else {"device": device.type}
     held = torch.cuda.get_device_properties(device)

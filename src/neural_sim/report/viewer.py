@@ -1,6 +1,6 @@
 """A page in the browser that shows an object's field, the cameras of its bins, and renders with detections.
 
-Needs viser (the extra ``viewer``), except for ``Shots``, which computes what the page shows.
+The page needs viser (the extra ``viewer``); ``Shots``, which computes what it shows, does not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""preflight.html, which says whether an optimisation is worth it, by what is known before it."""
+"""preflight.html, which says whether an optimisation is worthwhile, judging by what is known beforehand."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Preflight:
         mismatches: statistics of renders and of the target.
         settings: settings that would match them.
         distance_factor: factor on camera distances that would match the sizes of boxes; None: they agree.
-        labelled: gains of numbers of labelled photographs in training; empty if none are for training.
+        labelled: gains from labelled photographs in training, by their number; empty if none are for training.
         score: the kind of score.
         shown: the estimate from the target's boxes.
         caution: a warning to show first; empty: none.

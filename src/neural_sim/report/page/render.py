@@ -54,7 +54,7 @@ def png_uri(path: Path) -> str | None:
 def data_uri(figure: Figure) -> str:
     """Return a figure as the source of an ``<img>``: an SVG whose text stays text.
 
-    As separate images, figures cannot confuse their SVG ids.
+    Figures are embedded as separate images so that their SVG ids cannot clash.
     """
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neural-sim"}):
