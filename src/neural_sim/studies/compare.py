@@ -311,7 +311,8 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
             colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
             for line, run in enumerate(run for run in runs if run.method == method):
                 spent = [point[key] for point in run.results["curve"]]
-                # A step function, as for the area under it: at any time a method has the score it has reached so far.
+                # A step function: at any time a method has the score it has reached so far. (Areas interpolate
+                # the score linearly in log seconds instead.)
                 axes.plot(
                     spent, 100 * biased_ap(run, comparison.clock)[1], ".-", drawstyle="steps-post", color=colour,
                     alpha=0.7, linewidth=1, label=method if line == 0 else None,

@@ -61,7 +61,7 @@ class Found:
 @validated
 @dataclass(frozen=True)
 class DetectionGallery(Task):
-    """``+experiment=detection_gallery``.
+    """``+experiment=detection_gallery``: draw and count the detections of several methods on the same photographs.
 
     Args:
         methods: baselines; the detector of each is trained on the distribution that it learned.
@@ -220,7 +220,7 @@ def _draw(
         name = class_names[int(found["labels"][index])]
         text = f"{name} {float(found['scores'][index]):.2f}"
         inside = y0 < 0.06 * width  # no room above the box
-        left = x0 + x1 < width  # of two sides that with more room
+        left = x0 + x1 < width  # the side with more room
         axes.text(
             max(x0, 0.0) if left else min(x1, width), y0, text, fontsize=5.5, color="white", clip_on=True,
             ha="left" if left else "right", va="top" if inside else "bottom",

@@ -71,7 +71,7 @@ class Truth:
 @validated
 @dataclass(frozen=True)
 class Temperatures(Task):
-    """``+experiment=gumbel_temperature``.
+    """``+experiment=gumbel_temperature``: compare derivatives at several temperatures with that over hard bins.
 
     Args:
         values: the temperatures tau.
@@ -148,7 +148,7 @@ def against(
     off = mean - truth
     noise = variance / len(estimates) + truth_errors.square()
     bias = math.sqrt(max(0.0, float(off.square().sum() - noise.sum())))
-    # |off| varies with the noise along off; without a bias, with all of it.
+    # The error of |off| is the noise along off or, if no bias is measurable, all of the noise.
     along = float((off.square() * noise).sum().sqrt() / off.norm().clamp_min(1e-30))
     error = along if bias > 0.0 else float(noise.sum().sqrt())
     cosine = float(mean @ truth / (mean.norm() * truth.norm()).clamp_min(1e-30))

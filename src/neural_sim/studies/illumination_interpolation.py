@@ -32,7 +32,10 @@ UNCHANGED = 1e-6
 
 @dataclass(frozen=True)
 class InterpolatedViews:
-    """One object's images between two lights; ``opacity_change`` is the largest from the first, over all pixels."""
+    """One object's images between two lights.
+
+    ``opacity_change`` is the largest change from the first image, over all pixels.
+    """
 
     images: Float[Tensor, "steps height width 3"]
     opacity_change: float

@@ -30,9 +30,10 @@ ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
 @validated
 @dataclass(frozen=True)
 class NerfVsMesh(Task):
-    """``+experiment=nerf_vs_mesh``: one detector trained on images of the fields and of the meshes.
+    """``+experiment=nerf_vs_mesh``: compare detectors trained on images of fields and on images of meshes.
 
-    Both have the same poses and distances, and are scored on images of one and of several objects.
+    Both kinds of images have the same poses and distances. All detectors are scored on images of one and of several
+    objects.
 
     Args:
         single: fewest and most objects per image in the first test set.

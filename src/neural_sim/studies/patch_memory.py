@@ -39,11 +39,11 @@ class PatchCost:
     Attributes:
         object: the object's name.
         method: forward or reverse mode, and the patch.
-        patch: rays of a patch; None in forward mode.
+        patch: rays per patch; None in forward mode.
         gradient_mb: peak memory of the renderer's derivative in MiB; in forward mode of the render that computes it,
             without the maps and their derivatives.
         total_mb: peak memory in MiB of the whole estimate from one image of every object: rendering, the loss's
-            derivative by the images, the renderer's derivative.
+            derivative with respect to the images, the renderer's derivative.
         milliseconds: wall time of rendering and the renderer's derivative.
         cpu_milliseconds: processor time of all cores for the same.
         difference: distance from the result of forward mode, relative to the latter's norm.
@@ -62,7 +62,9 @@ class PatchCost:
 @validated
 @dataclass(frozen=True)
 class PatchMemory(Task):
-    """``+experiment=patch_memory``.
+    """``+experiment=patch_memory``: measure memory and time of the renderer's derivative.
+
+    It is taken in reverse mode with several patch sizes, and in forward mode.
 
     Args:
         patches: patch sizes in rays, for reverse mode.

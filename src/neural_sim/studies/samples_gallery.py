@@ -40,7 +40,7 @@ class Samples:
 @validated
 @dataclass(frozen=True)
 class SamplesGallery(Task):
-    """``+experiment=samples_gallery``.
+    """``+experiment=samples_gallery``: draw training images from what each method learned, next to test images.
 
     Args:
         methods: baselines that learn psi, each with its own settings.

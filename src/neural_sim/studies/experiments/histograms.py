@@ -1,4 +1,4 @@
-"""Learned and target distributions (the paper's Fig. 7) and total variation over seeds; bins that look alike merge."""
+"""Learned and target distributions (the paper's Fig. 7), total variation over seeds; bins that look alike are merged."""
 
 from __future__ import annotations
 

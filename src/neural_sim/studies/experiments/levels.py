@@ -16,8 +16,9 @@ from neural_sim.studies.experiments.settings import Setting, called, modes
 
 Axis = Literal["gap", "target"]
 STARTS = {"same": "the target's", "uniform": "uniform", "disjoint": "disjoint"}
-COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
 """The starts in the paper's Fig. 5."""
+COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
+"""Line colours of the methods."""
 APART = 0.03
 """Horizontal offset between methods, as a fraction of the distance between ticks."""
 LABELS = {"gap": "initial distribution", "target": "bins of the target"}

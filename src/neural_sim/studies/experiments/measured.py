@@ -104,7 +104,8 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
     """Read results by row name; empty if the file does not exist.
 
     Raises:
-        UserError: its results are for another ``budget`` (scale): a page has one, and would lose them.
+        UserError: its results are for another ``budget`` (scale); a page
+            holds one scale, so writing it would lose them.
     """
     if not file.is_file():
         return {}

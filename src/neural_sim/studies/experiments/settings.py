@@ -1,4 +1,4 @@
-"""The settings of an experiment that were run, each with its runs and scores, by the newest way of scoring."""
+"""The settings of an experiment that were run, each with its runs and their scores, scored in the newest way."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from neural_sim.report.tracking import UNKNOWN
 
 AXES = re.compile(r"parameter\.\w+\.(gap|biased)\b|training\.real\.(mode|count|fraction)$")
 """Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects, and how
-many photographs train, and how."""
+many photographs are trained on, and how."""
 MEAN = "mAP"
 """Name under which the mean over biased objects is listed with the objects."""
 CALLED = {"ns": "NS", "matched": "matched", "neural_sim": "NSO", "auto_sim": "Auto-Sim", "lts": "LTS"}
@@ -151,7 +151,7 @@ class Settings:
         return [Setting.of(group, self.reference, self.draws, self.seed) for group in groups], left_out
 
     def groups(self, runs: Runs) -> tuple[list[Group], list[LeftOut]]:
-        """Return groups of runs to compare; if an experiment was scored in several ways, those of the newest way."""
+        """Return groups of runs to compare; if an experiment was scored in several ways, those scored in the newest."""
         right = runs.without(lambda run: None if self._at_scale(run) else "it was run at another scale")
         found, left_out = select(right, self.reference)
         newest: dict[str, str] = {}

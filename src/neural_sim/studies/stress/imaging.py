@@ -101,7 +101,7 @@ def zoom_ends(scope: Scope) -> Checks:
         draw = scene.hard(torch.zeros(8, dtype=DOUBLE), noise)
         gap = worst(draw.distance / torch.tensor(ends, dtype=DOUBLE) - 1.0)
         yield Check(f"distances drawn: {ends[0]:g} to {ends[1]:g}", gap, 4 * eps(DOUBLE))
-    half = 0.55  # within the unit sphere to its corners
+    half = 0.55  # small enough that its corners, too, lie in the unit sphere
     for sigma in (1.0, OPAQUE):
         field = block(sigma, half=half)
         for distance in (1.0 + 1e-6, 2.4, 4.0, 1e3, 1e5):
@@ -152,7 +152,7 @@ def bfloat16(scope: Scope) -> Checks:
 
 @case
 def extreme_boxes(scope: Scope) -> Checks:
-    """Assign anchors to a box of one pixel, of the whole image, at its corner, and to a sliver.
+    """Assign anchors to a box of one pixel, a box of one corner pixel, the whole image, and a sliver.
 
     Each box gets the anchor that overlaps it most (low-quality matches), its encoding decodes to the same box, and loss
     and gradient are finite. So they are without any box, when every anchor is background.

@@ -165,7 +165,7 @@ def degenerate(scope: Scope) -> Checks:
 
 @case
 def indefinite_hessians(scope: Scope) -> Checks:
-    """Damp Hessians of any sign and condition by default, with as many Lanczos steps as parameters.
+    """Damp Hessians of any sign and condition by the default rule, with as many Lanczos steps as parameters.
 
     The damping must pass the most negative eigenvalue by its margin (to the rounding n eps |H| of a Ritz value), and
     the solve reach the dense one: condition of the damped matrix times rtol and n^2 eps.

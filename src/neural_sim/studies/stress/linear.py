@@ -64,7 +64,7 @@ class System:
         return System(matrix, self.basis, self.values, truth, b)
 
     def solve(self, solver: LinearSolver, rtol: float, max_steps: int = 400) -> Solution:
-        """Solve by one of the solvers."""
+        """Solve with one of the solvers."""
         return solver.solve(self.matrix.mv, self.b, rtol=rtol, max_steps=max_steps)
 
 
@@ -172,12 +172,12 @@ def singular(scope: Scope) -> Checks:
     """Solve with three zero eigenvalues.
 
     With b in the range: the minimum-norm solution, from a closed form in the eigenbasis, by the bound of
-    ``condition_numbers``; a step adds at most n eps |A| |x| outside it, which costs 1 / (smallest non-zero eigenvalue)
-    at most, that is the same bound with the number of steps for n.
+    ``condition_numbers``. Each step adds at most n eps |A| |x| outside it; divided by the smallest non-zero eigenvalue,
+    this is the same bound with the number of steps in place of n.
 
-    With a part of b outside it, and for the zero operator: the least residual, |P_null b| / |b|. Of a residual that is
-    minimal only the square sees an error of x, so the same bound more than holds. Solvers for definite systems may not
-    claim success, and do no worse than zero.
+    With a part of b outside it, and for the zero operator: the least residual, |P_null b| / |b|. A minimal residual
+    depends on an error of x only to second order, so the same bound holds with room to spare. Solvers for definite
+    systems may not claim success, and do no worse than zero.
     """
     condition, rank = 1e3, SIZE - 3
     values = torch.cat([logarithmic(condition, rank), torch.zeros(3, dtype=DOUBLE)])
@@ -211,8 +211,8 @@ def singular(scope: Scope) -> Checks:
 def units(scope: Scope) -> Checks:
     """Solve for b = 0, which gives exactly 0, and in other units.
 
-    b or the operator times a power of two changes no digit of the solution, out to where squares of the operator's
-    entries leave the range of the arithmetic.
+    Multiplying b or the operator by a power of two changes no digit of the solution, even where the squares of the
+    operator's entries leave the range of the arithmetic.
     """
     for dtype, powers in ((SINGLE, (-90, 90)), (DOUBLE, (-900, -600, 600, 900))):
         problem = system(logarithmic(1e3), scope.generator())
@@ -234,7 +234,10 @@ def units(scope: Scope) -> Checks:
 
 @case
 def one_parameter(scope: Scope) -> Checks:
-    """Solve for one unknown: x = b / a to a few roundings, whatever the size or (where it may) sign of a."""
+    """Solve for one unknown: x = b / a to a few roundings.
+
+    This holds for any size of a and, with solvers that allow it, either sign.
+    """
     b = torch.tensor([6.0], dtype=DOUBLE)
     for entry in (3.0, 1e-300, 1e-20, 1e20, 1e300, -3.0):
         for name in SOLVERS:
@@ -251,8 +254,8 @@ def one_parameter(scope: Scope) -> Checks:
 def non_finite_operators(scope: Scope) -> Checks:
     """Solve with NaN and inf at once or only from the third product on, in b, and with overflow.
 
-    Wanted are a status, and no number that is not finite anywhere in the solution. A bad warm start is dropped and
-    costs nothing.
+    The solution must have a status, and every number in it must be finite. A bad warm start is dropped and costs
+    nothing.
     """
     problem = system(logarithmic(1e3), scope.generator())
     plain, nothing = problem.matrix.mv, problem.b.clone()

@@ -173,8 +173,8 @@ class Constant:
 def loop(scope: Scope) -> Checks:
     """Run the whole psi loop on a cube with 4 bins and an estimator that returns NaN, inf, 1e30 or 0.
 
-    Psi must be finite and within the bound of its steps. Zero and gradients that are not finite must not move psi, and
-    the certificate of the latter must say what was done.
+    Psi must be finite and within the bound of its steps. A zero or non-finite gradient must not move psi, and the
+    certificate of the latter must say what was done.
     """
     iterations = 2
     actions = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}

@@ -82,7 +82,7 @@ def floor(scope: Scope) -> Checks:
             truth = (1.0 - count * smallest) * softmax + smallest
             log_p = binned.log_probabilities(leaf, smallest)
             p = log_p.detach().double().exp()
-            # An error of psi's rounding in the exponent counts only as far as the softmax part is there.
+            # Rounding of psi in the exponent matters only where the softmax part is not negligible next to the floor.
             bound = (8.0 + min(depth, 30.0)) * eps(dtype)
             label = f"psi = -{depth:g}, {short(dtype)}"
             yield Check(f"p: {label}", worst((p - truth) / truth), bound)
@@ -96,10 +96,10 @@ def floor(scope: Scope) -> Checks:
 def temperatures(scope: Scope) -> Checks:
     """Relax the same draws at tau from 1e-4 to 1e3.
 
-    Against the float64 softmax of the same numbers, float32 rounds G + log p and its quotient by tau, 2 eps |z| in the
-    exponent each way: y to exp(4 eps max|z|) - 1 relatively. As tau falls 1 - max y <= (k - 1) exp(-gap / tau); as it
-    rises |y - 1 / k| <= (exp(range / tau) - 1) / k. The derivative (diag y - y y^T) / tau has no entry above 1 / (4
-    tau).
+    Compared with the float64 softmax of the same numbers, float32 rounds G + log p and its quotient by tau, each by
+    2 eps |z| in the exponent, so the relative error of y is at most exp(4 eps max|z|) - 1. As tau falls,
+    1 - max y <= (k - 1) exp(-gap / tau); as it rises, |y - 1 / k| <= (exp(range / tau) - 1) / k. The derivative
+    (diag y - y y^T) / tau has no entry above 1 / (4 tau).
     """
     count, draws = 8, 500
     log_p = torch.log_softmax(scope.normal(count), -1)
@@ -163,7 +163,7 @@ def gumbel_max(scope: Scope) -> Checks:
 def bin_counts(scope: Scope) -> Checks:
     """Draw from k of 1, 2 and 64 bins: hard draws lie in their bin, also at its very edges.
 
-    An angle at an edge belongs to the bin within the rounding of the angle, 4 eps 2 pi; a miss is by that at most.
+    An angle at an edge lies in its bin up to the rounding of the angle, at most 4 eps 2 pi.
     """
     for dtype in (DOUBLE, SINGLE):
         for count in (1, 2, 64):

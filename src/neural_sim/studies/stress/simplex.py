@@ -15,8 +15,8 @@ from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope
 def exact_projection(values: Tensor) -> list[float]:
     """Project one vector without any rounding, from the optimality conditions of the quadratic programme.
 
-    ``w = max(v - t, 0)`` with the t that makes the sum 1; the sum falls in t, so among the thresholds that the m
-    largest entries give the largest one is t.
+    ``w = max(v - t, 0)`` with the t that makes the sum 1; the sum falls in t, so t is the largest of the thresholds
+    given by the m largest entries, over all m.
     """
     entries = [Fraction(float(value)) for value in values]
     ordered = sorted(entries, reverse=True)
@@ -48,12 +48,12 @@ def _extremes(dtype: torch.dtype, noise: Tensor) -> dict[str, Tensor]:
 
 @case
 def projection(scope: Scope) -> Checks:
-    """Project vectors, against the projection of the very float given in exact rational arithmetic.
+    """Project vectors, against the exact projection of the same floats, in rational arithmetic.
 
-    Differences to the largest entry are at most 1 after clamping and rounded once (eps / 2 of at most 1), the sum of k
-    of them by k eps, the threshold and the result once more: (k + 4) eps. The weights then sum to 1 within k times
-    that. On the plane of sum 1, v - (mean(v) - 1 / k): mean and differences round by k eps max|v| each, and k of them
-    are summed.
+    After clamping, differences from the largest entry are at most 1 and are rounded once (eps / 2). Their sum over k
+    entries adds k eps, the threshold and the result one rounding each: (k + 4) eps in all. The weights then sum to
+    1 within k times that. On the plane of sum 1, v - (mean(v) - 1 / k): mean and differences round by k eps max|v|
+    each, and k of them are summed.
     """
     for dtype in (DOUBLE, SINGLE):
         for label, values in _extremes(dtype, scope.normal(64)).items():

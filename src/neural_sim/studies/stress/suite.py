@@ -27,7 +27,7 @@ FAMILIES: tuple[Family, ...] = get_args(Family)
 @validated
 @dataclass(frozen=True)
 class Stress(Task):
-    """Run every case of ``families``; without ``full``, in smaller versions of the heavy ones."""
+    """Run every case of ``families``; without ``full``, heavy cases run in a smaller version."""
 
     families: Annotated[Sequence[Family], MinLen(1)] = FAMILIES
     full: bool = True

@@ -1,1 +1,1 @@
-"""Error against run time for every choice that sets a default; each file is one family of measurements."""
+"""Error against run time, the evidence behind the defaults; a key of the settings is a family, in a file of its own."""

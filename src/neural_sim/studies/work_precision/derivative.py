@@ -1,4 +1,4 @@
-"""The derivative of an image by its scene parameters: forward mode, reverse mode (also by patches), differences.
+"""The derivative of an image with respect to its scene parameters: forward and reverse mode, patches, differences.
 
 Every way computes the m numbers d<cotangent, image>/dV for a given cotangent that is nonzero in every pixel. Reverse
 mode takes two renders and one backward pass (the paper's Tool 3), forward mode takes one render.
@@ -130,7 +130,7 @@ class Derivative:
     """The family ``derivative``.
 
     Args:
-        size: pixels a side.
+        size: pixels per side.
         numbers: numbers m of camera parameters to differentiate by; one series each.
         patches: patch sizes in rays, for reverse mode.
         steps: steps of the central differences, in radians and object radii.

@@ -1,8 +1,9 @@
 """Estimators of the hypergradient's mixed term against the derivative over hard bins, by images and seconds.
 
 Each gives d/dpsi <dL_train/dtheta, v> of one object's psi from N images, drawn and bound as in the psi loop. The
-reference, g_i = p_i (s_i - sum_j p_j s_j) up to the floor's factor with s_b the mean score <dl/dtheta, v> of bin b, is
-the derivative of the distribution that training images are drawn from. It is an estimate too, from other images.
+reference is g_i = p_i (s_i - sum_j p_j s_j), up to the floor's factor, where s_b is the mean score <dl/dtheta, v> of
+bin b. It is the derivative of the distribution that training images are drawn from, and an estimate, too, from other
+images.
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ def _points(
 
 
 def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
-    """Return slopes of the objects' scores by the fraction of images moved to each bin, and the time they took.
+    """Return slopes of scores with respect to the fraction of images moved to each bin, and the time they took.
 
     Images, training and probes are the same for all ways: common random numbers, and a generator with the same seed.
     """

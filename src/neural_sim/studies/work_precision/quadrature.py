@@ -41,7 +41,7 @@ Along = Float[Tensor, "rays samples"]
 class Density:
     """A density along rays at distances from 0 to ``SPAN``, displaced by each ray's ``offset`` in [0, 1).
 
-    ``resolved`` is the largest step from which on theory gives an order; ``midpoint`` and ``jittered`` are the orders.
+    ``resolved`` is the largest step for which theory gives an order; ``midpoint`` and ``jittered`` are the orders.
     """
 
     sigma: Callable[[Along, Along], Along]

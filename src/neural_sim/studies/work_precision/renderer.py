@@ -85,9 +85,9 @@ class Renderer:
     """The family ``renderer``.
 
     Args:
-        size: pixels a side.
+        size: pixels per side.
         views: number of held-out poses to render.
-        terminations: transmittances beyond which samples are skipped.
+        terminations: transmittances below which samples are skipped.
         steps: multiples of the field's step.
     """
 

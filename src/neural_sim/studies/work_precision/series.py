@@ -129,7 +129,7 @@ def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
 def slope(steps: Sequence[float], errors: Sequence[float]) -> float:
     """Return the least-squares slope of log ``errors`` over log ``steps``.
 
-    It is NaN if an error is 0 or there are fewer than two.
+    It is NaN if an error is 0 or not finite, there are fewer than two, or all steps are equal.
 
     Raises:
         ValueError: the sequences have different lengths, or a step is not positive.

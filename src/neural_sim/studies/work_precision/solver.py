@@ -88,7 +88,7 @@ class Inverse:
     b: Float[Tensor, "n"]
     oracle: Oracle
     seconds: float
-    """The eigenvalues of the dense reference."""
+    """Time that the eigenvalues of the dense reference took."""
     timing: Timing
     seed: int
 

@@ -1,4 +1,4 @@
-"""``+experiment=work_precision``: error against run time for every choice that sets a default."""
+"""``+experiment=work_precision``: error against run time, the evidence behind the defaults."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Name = Literal[
 FAMILIES: tuple[Name, ...] = get_args(Name)
 """Families in the order of the psi loop; each is a key of the settings."""
 COMMAND = "python -m src.main +experiment=work_precision"
-"""Command that a documentation page gives for its sections, which are made at its scale, quick."""
+"""Command shown in the sections of a documentation page; it runs at the scale ``quick``, at which they are made."""
 READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
     "renderer": lambda graph: graph.fields,
     "field": lambda graph: graph.views,
@@ -51,7 +51,7 @@ READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
 @validated
 @dataclass(frozen=True)
 class WorkPrecision(Task):
-    """``+experiment=work_precision``.
+    """``+experiment=work_precision``: measure error against run time, family by family.
 
     Args:
         families: which of the other keys are measured, in this order.
