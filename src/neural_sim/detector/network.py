@@ -30,7 +30,6 @@ class NormalisedBackbone(nn.Module):
         self.backbone = backbone
 
     @override
-    @override
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         mean, std = (_channels(values, images) for values in (IMAGENET_MEAN, IMAGENET_STD))
         # A third faster on a CPU than the default layout, forwards and backwards.
@@ -74,7 +73,6 @@ class Predictor(nn.Module):
         self.fpn = fpn
         self.head = head
 
-    @override
     @override
     def forward(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
         pyramid = self.fpn(OrderedDict((str(level), x) for level, x in enumerate(features)))

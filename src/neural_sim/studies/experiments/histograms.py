@@ -1,4 +1,7 @@
-"""Learned and target distributions (the paper's Fig. 7), total variation over seeds; bins that look alike are merged."""
+"""Learned and target distributions (the paper's Fig. 7) and total variation over seeds.
+
+Bins that look alike are merged.
+"""
 
 from __future__ import annotations
 
