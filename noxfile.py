@@ -45,6 +45,19 @@ def slow(session: nox.Session) -> None:
 
 
 @nox.session
+def coverage(session: nox.Session) -> None:
+    """Measure the branch coverage of the mathematics by its own tests; fail below 95 %."""
+    _install(session)
+    session.env["OMP_NUM_THREADS"] = "1"
+    packages = ("parameter", "gradient", "solver")
+    session.run(
+        "python", "-m", "pytest", *(f"tests/{name}" for name in packages),
+        *(f"--cov=neural_sim.{name}" for name in packages),
+        "--cov-branch", "--cov-fail-under=95", "--cov-report=term-missing:skip-covered", *session.posargs,
+    )  # fmt: skip
+
+
+@nox.session
 def lint(session: nox.Session) -> None:
     """Check style, format and spelling, without importing the project."""
     session.install("-c", "requirements.lock", "ruff", "codespell")
