@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neural_sim.gradient.estimators import importance_weights, stratified
-from neural_sim.gradient.implicit import InnerProblem, hypergradient
+from neural_sim.gradient.implicit import Implicit, InnerProblem, curvature_rows, hypergradient
 from neural_sim.gradient.mixed import scores
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import Status
@@ -138,3 +138,56 @@ def test_inner_problem_refuses_nonsense(problem, change, message):
     inner = problem.inner(problem.object_images().images)
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(inner, **change)
+
+
+def test_the_sensitivity_is_the_relative_change_of_psis_gradient_at_twice_the_damping(problem, pathwise):
+    batch = problem.object_images()
+    inner = problem.inner(batch.images)
+
+    def at(damping, **settings):
+        solver = dataclasses.replace(EXACT, damping=FixedDamping(damping, 0), **settings)
+        return solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch), solver)
+
+    one, two = (at(damping).gradients["can"] for damping in (0.5, 1.0))
+    found = at(0.5, sensitivity=True).adjoint.sensitivity
+    assert found == pytest.approx(float((two - one).norm() / one.norm()), rel=1e-8) and found > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("changes", "doubts"),
+    [
+        ({}, []),
+        ({"residual": 0.2}, ["residual"]),
+        ({"residual": 0.2, "status": Status.APPROXIMATE}, []),
+        ({"stationarity": 3.0, "sensitivity": 0.6}, ["stationarity", "sensitivity"]),
+        ({"sensitivity": None}, []),
+        ({"status": Status.NON_FINITE}, ["solver"]),
+    ],
+)
+def test_a_solve_is_doubted_beyond_its_limits(problem, pathwise, changes, doubts):
+    batch = problem.object_images()
+    inner = problem.inner(batch.images)
+    adjoint = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch)).adjoint
+    adjoint = dataclasses.replace(adjoint, stationarity=1.0, sensitivity=0.1)
+    of_solution = {key: changes[key] for key in ("residual", "status") if key in changes}
+    of_adjoint = {key: value for key, value in changes.items() if key not in of_solution}
+    solution = dataclasses.replace(adjoint.solution, **of_solution)
+    changed = dataclasses.replace(adjoint, solution=solution, **of_adjoint)
+    assert Implicit(max_stationarity=2.0, max_sensitivity=0.5).doubts(changed) == doubts
+
+
+def test_rows_of_the_curvature_keep_the_weight_of_drawn_images_and_of_photographs():
+    """60 images drawn from p_psi have three quarters of the weight, 20 photographs the rest."""
+    weights = torch.cat([torch.full((60,), 0.75 / 60), torch.full((20,), 0.25 / 20)]).double()
+    generator = torch.Generator().manual_seed(0)
+    seen = torch.zeros(80, dtype=DOUBLE)
+    for _ in range(400):
+        rows, scaled = curvature_rows(60, weights, 16, generator)
+        assert len(rows.unique()) == 16 and int((rows < 60).sum()) == 12
+        torch.testing.assert_close(scaled[rows < 60].sum().double(), torch.tensor(0.75, dtype=DOUBLE))
+        torch.testing.assert_close(scaled.sum().double(), torch.tensor(1.0, dtype=DOUBLE))
+        seen[rows] += scaled.double() / 400
+    # 400 samples of 12 out of 60 (4 of 20): each row's mean weight scatters by 10 % of it.
+    assert ((seen / weights - 1.0).abs() < 0.5).all()
+    rows, same = curvature_rows(60, weights, 0, generator)
+    assert torch.equal(rows, torch.arange(80)) and same is weights
