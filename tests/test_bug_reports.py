@@ -248,7 +248,7 @@ def test_18_folders_and_categories_of_digits_are_classes(tmp_path):
 def test_19_what_is_no_database_is_refused_at_once_with_its_key(tmp_path):
     out = laid_out("19", tmp_path)
     reasons = {
-        "garbage": "is no SQLite database",
+        "garbage": "is not an SQLite database",
         "folder": "is a folder, want a file",
         "newer": "a newer MLflow",
     }

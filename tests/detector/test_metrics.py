@@ -91,7 +91,7 @@ def test_a_score_that_tells_nothing_says_why_in_one_line():
 def test_mismatches_and_empty_sets_are_refused():
     with pytest.raises(ValueError, match="no images"):
         evaluate([], labelled([[0]]).select(slice(0, 0)), NAMES)
-    with pytest.raises(ValueError, match="prediction an image"):
+    with pytest.raises(ValueError, match="one prediction per image"):
         evaluate([], labelled([[0]]), NAMES)
     with pytest.raises(ValueError, match="has no name"):
         evaluate([found([], [], [])], labelled([[5]]), NAMES)

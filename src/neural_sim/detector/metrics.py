@@ -87,7 +87,7 @@ def evaluate(
         raise ValueError("evaluate: got no images, want at least one")
     if len(predictions) != len(images):
         raise ValueError(
-            f"evaluate: want a prediction an image, got {len(predictions)} for {len(images)} images"
+            f"evaluate: want one prediction per image, got {len(predictions)} for {len(images)} images"
         )
     labels = images.labels[images.present]
     if labels.numel() and int(labels.max()) >= len(class_names):

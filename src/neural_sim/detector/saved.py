@@ -159,7 +159,9 @@ def _image_size(document: Mapping[str, Any], file: Path) -> tuple[int, int]:
     image = _mapping(document, "image", file)
     for key in ("height", "width"):
         if type(image.get(key)) is not int or image[key] < 1:
-            raise ValueError(f"{file}: image.{key}: want a whole number from 1, got {image.get(key)!r}")
+            raise ValueError(
+                f"{file}: image.{key}: want a whole number of at least 1, got {image.get(key)!r}"
+            )
     for key, wanted in (("channels", "RGB"), ("range", [0.0, 1.0])):
         if image.get(key) != wanted:
             raise ValueError(f"{file}: image.{key}: want {wanted!r}, got {image.get(key)!r}")
@@ -315,8 +317,8 @@ def _detector_class(name: Any, where: str, outside: str | None) -> type:
     ours, target = module.partition(".")[0] == __name__.partition(".")[0], f"{module}.{qualified}"
     if not ours and module not in sys.modules and target != outside:
         raise ValueError(
-            f"{where}: {name} is no detector of this package, and reading it runs code of {module}: if you trust that, "
-            f"add detector._target_={target}"
+            f"{where}: {name} is not a detector of this package, and reading it runs code of {module}: if you trust "
+            f"that, add detector._target_={target}"
         )
     try:
         found: Any = functools.reduce(getattr, qualified.split("."), importlib.import_module(module))
@@ -324,7 +326,7 @@ def _detector_class(name: Any, where: str, outside: str | None) -> type:
         raise ValueError(f"{where}: {name} cannot be imported ({error}); is it on PYTHONPATH?") from error
     if not isinstance(found, type) or not issubclass(found, Detector):
         raise ValueError(
-            f"{where}: {name} is no detector, want a class that derives from neural_sim.detector.protocol.Detector"
+            f"{where}: {name} is not a detector, want a class that derives from neural_sim.detector.protocol.Detector"
         )
     return found
 

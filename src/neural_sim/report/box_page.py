@@ -85,7 +85,7 @@ class BoxPage:
         try:
             import viser
         except ImportError as error:
-            raise ValueError("stages=[box] wants viser: pip install 'neural-sim[viewer]'") from error
+            raise ValueError("stages=[box] needs viser: pip install 'neural-sim[viewer]'") from error
         self.server = viser.ViserServer(
             host="127.0.0.1", port=self.port, label=self.capture.name, verbose=False
         )

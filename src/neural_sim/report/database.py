@@ -44,7 +44,7 @@ def check_database(database: Path) -> None:
             return
         with database.open("rb") as file:
             if file.read(len(_SQLITE)) != _SQLITE:
-                raise ValueError(f"paths.mlflow: {database} is no SQLite database; {todo}")
+                raise ValueError(f"paths.mlflow: {database} is not an SQLite database; {todo}")
         with closing(
             # Not read-only, so that SQLite rolls back what a killed process left half written in the journal.
             sqlite3.connect(database.as_uri() + "?mode=rw", uri=True, timeout=_PATIENCE)

@@ -152,7 +152,7 @@ class Viewer:
         try:
             import viser
         except ImportError as error:
-            raise ValueError("stages=[viewer] wants viser: pip install 'neural-sim[viewer]'") from error
+            raise ValueError("stages=[viewer] needs viser: pip install 'neural-sim[viewer]'") from error
         self.shots = shots
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label="Neural-Sim", verbose=False)
         gui, scene = self.server.gui, shots.scene

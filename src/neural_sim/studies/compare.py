@@ -206,7 +206,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         heading: how these runs differ from others of the setting.
     """
     c = comparison
-    bold = "Differences in bold exceed the spread: their interval leaves 0 out. "
+    bold = "Differences in bold exceed the spread: their interval excludes 0. "
     if not c.several:
         bold = "None is in bold: intervals of one seed leave out how much trainings differ. "
     parts = [

@@ -84,7 +84,8 @@ class PatchMemory(Task):
         x = context.experiment
         rows = self.measure(FrozenLoop.of(context, x.run.seed), _estimator(context), x.run.seed)
         camera, field = context.graph.camera, type(context.results(context.graph.fields[0]).field).__name__
-        setting = f"{field}, {camera.width} x {camera.height} pixels, {x.imaging.renderer.rays_per_chunk} rays a chunk"
+        rays = x.imaging.renderer.rays_per_chunk
+        setting = f"{field}, {camera.width} x {camera.height} pixels, {rays} rays per chunk"
         publish(context, rows, setting)
 
     def measure(self, loop: FrozenLoop, estimator: PathwiseEstimator, seed: int) -> list[PatchCost]:
@@ -211,11 +212,11 @@ def publish(context: Context, rows: Sequence[PatchCost], setting: str) -> Run | 
 def table(rows: Sequence[PatchCost], setting: str) -> str:
     """Return Markdown with one table per object."""
     parts = [
-        f"Derivative of one image by the scene parameters that depend on psi ({setting}). *Gradient* is the working "
-        "memory of the renderer's derivative, *total* that of the whole estimate with the detector's, from one image "
-        "of every object."
+        f"Derivative of one image with respect to the scene parameters that depend on psi ({setting}). *Gradient* is "
+        "the working memory of the renderer's derivative, *total* that of the whole estimate with the detector's, from "
+        "one image of every object."
     ]
-    head = ["method", "gradient, MB", "total, MB", "ms", "CPU ms", "relative difference from forward"]
+    head = ["method", "gradient, MiB", "total, MiB", "ms", "CPU ms", "relative difference from forward"]
     for name in dict.fromkeys(row.object for row in rows):
         cells = [
             (

@@ -136,7 +136,7 @@ def held_out_table(objects: Sequence[HeldOut]) -> str:
     rows["mean"] = np.mean(list(rows.values()), 0).tolist()
     head = ["object", *(name for source in sources for name in (source, f"{source}, object"))]
     cells = [[name, *(f"{value:.1f}" for value in row)] for name, row in rows.items()]
-    note = "PSNR on held-out views in dB, whole images over white, and of the pixels that show the object."
+    note = "PSNR in dB on held-out views: of whole images over white, and of the object's pixels only."
     return f"{note}\n\n{markdown_table(head, cells)}"
 
 

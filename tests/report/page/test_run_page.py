@@ -241,7 +241,7 @@ def test_a_curve_is_drawn_of_three_points_or_more_with_labels_that_do_not_meet(r
     ("change", "said"),
     [
         ({"taken_back": {"can": {"kept": 0, "accepted": 2, "gain": 0.1}}}, "went back to its start"),
-        ({}, "It did not move: its derivative was never told from zero."),
+        ({}, "It did not move: its derivative was never distinguished from zero."),
         ({"verdicts": {"can": {"accepted": False}}}, "It did not move: trainings rejected its steps."),
     ],
 )

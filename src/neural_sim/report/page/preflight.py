@@ -78,8 +78,8 @@ class Preflight:
     def _verdict(self) -> str:
         if not self.promising:
             return (
-                "Not worth optimising as it is configured: no object's derivative can be told from zero, so the loop "
-                "would not know where to go."
+                "Not worth optimising as it is configured: no object's derivative can be distinguished from zero, so "
+                "the loop would not know where to go."
             )
         names = list(dict.fromkeys(f.name for f in self.promising))
         return (

@@ -122,7 +122,7 @@ def _why_it_stayed(one: Learned, records: Sequence[Mapping[str, Any]]) -> str:
     if verdicts and not any(verdict["accepted"] for verdict in verdicts):
         return "It did not move: trainings rejected its steps."
     if actions == {"skipped"}:
-        return "It did not move: its derivative was never told from zero."
+        return "It did not move: its derivative was never distinguished from zero."
     return "It did not move."
 
 

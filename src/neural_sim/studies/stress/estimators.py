@@ -88,7 +88,7 @@ def significance(scope: Scope) -> Checks:
         "equal scores": no_association(torch.full_like(scores, 0.1), bins),
         "one bin drawn": no_association(scores, torch.ones_like(bins)),
         "one image": no_association(scores[:1], bins[:1]),
-        "an image a bin": no_association(scores[:BINS], bins[::EACH]),
+        "one image per bin": no_association(scores[:BINS], bins[::EACH]),
         "a score of NaN": no_association(scores.clone().index_fill_(0, torch.tensor(0), math.nan), bins),
         "one scene": no_difference(scores[None]),
         "a scene's scores equal under every light": no_difference(scores[:, None].expand(-1, 3)),

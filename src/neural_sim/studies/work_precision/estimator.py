@@ -105,7 +105,7 @@ class Estimators:
         note = (
             f"The derivative by the centred logits of {', '.join(world.names)}, of the validation loss, "
             f"v {loop.solve}. Reference: {self.truth_per_bin} images of every bin; the exact vector would have a "
-            f"cosine of {cosines} with it. Seconds are an object's: drawing, rendering, the estimate."
+            f"cosine of {cosines} with it. Seconds are per object: drawing, rendering, the estimate."
         )
         for kind, error in (
             ("relative error", relative_error),

@@ -162,7 +162,7 @@ class Quadrature:
                     orders.append(self._order(density, rule, [row[place].error for row in rows]))
                 yield Series(
                     f"quadrature/{name}, {kind}", f"root mean square error of {kind}", tuple(points), tuple(orders),
-                    f"{self.rays} rays of 2 object radii, float64, against {FINER * self.counts[-1]} samples a ray.",
+                    f"{self.rays} rays of 2 object radii, float64, against {FINER * self.counts[-1]} samples per ray.",
                     timing.clock,
                 )  # fmt: skip
 

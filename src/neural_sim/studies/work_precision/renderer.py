@@ -105,7 +105,7 @@ class Renderer:
         found = {name: self._means(world.fields, one, camera, poses, timing) for name, one in named.items()}
         note = (
             f"Images of {self.size} x {self.size} pixels from {len(poses)} views of {', '.join(world.names)}, against "
-            "renders with nothing left out, at the field's own step; seconds are an image's."
+            "renders with nothing left out, at the field's own step; seconds are per image."
         )
         for kind, label in (
             ("opacity", "mean error of opacity"),
@@ -136,7 +136,7 @@ class Renderer:
         return {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
 
     def _point(self, name: str, row: Mapping[str, float], kind: str, quality: str) -> Point:
-        detail = f"{row['cast']:.0%} of the pixels, {row['samples']:.1f} samples a ray that hits"
+        detail = f"{row['cast']:.0%} of the pixels, {row['samples']:.1f} samples per ray that hits"
         default = name == f"quality, {quality}"
         memory = None if math.isnan(row["memory"]) else row["memory"]
         return Point(name, row[kind], row["seconds"], memory, default, name.partition(",")[0], detail)
