@@ -203,7 +203,8 @@ class Experiments(Task):
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "
             "set, in points. Brackets are 95 % intervals over seeds and test images; of a single seed they are too "
-            "narrow (docs/results.md, The same training again). NS is no optimisation, NSO is `baseline=neural_sim`. "
+            "narrow (docs/results.md, The same training again). NS is no optimisation, NSO is `baseline=neural_sim` "
+            "at a row's commit, which before 3490cc4 was today's `neural_sim_derivative`. "
             "Line numbers are those of the paper's LaTeX source."
         )
         written = f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. What has no runs there is kept."
