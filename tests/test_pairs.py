@@ -93,7 +93,7 @@ REFUSED = {
     ),
     "no camera": (
         lambda a, b: a == "camera=from_target" and b == "target=rendered",
-        "camera=from_target wants a target with a camera of its own",
+        "camera=from_target needs a target with a camera of its own",
     ),
 }  # fmt: skip
 """Pairs of choices that are refused, and what the line says."""

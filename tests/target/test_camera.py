@@ -45,8 +45,8 @@ def test_a_camera_matrix_is_opencvs():
     ("settings", "message"),
     [
         ({"width": 8}, "width and height or neither"),
-        ({"fy": 3.0}, "want fx"),
-        ({"cx": 3.0}, "want fx"),
+        ({"fy": 3.0}, "need fx"),
+        ({"cx": 3.0}, "need fx"),
         ({"fx": 3.0, "field_of_view_deg": 40.0}, "fx or field_of_view_deg"),
     ],
 )
@@ -87,9 +87,9 @@ def test_targets_without_a_camera_are_refused(tmp_path):
     document = json.loads(path.read_text())
     del document["camera"]
     path.write_text(json.dumps(document))
-    with pytest.raises(ValueError, match=r"labels.json: camera=from_target wants an entry 'camera'"):
+    with pytest.raises(ValueError, match=r"labels.json: camera=from_target needs an entry 'camera'"):
         TargetCamera().camera(8, 40.0, CocoTarget(path))
-    with pytest.raises(ValueError, match=r"from_target wants a target .* got RenderedTarget"):
+    with pytest.raises(ValueError, match=r"from_target needs a target .* got RenderedTarget"):
         TargetCamera().camera(8, 40.0, RENDERED)
 
 

@@ -235,7 +235,7 @@ def test_pose_bins_are_an_attribute_of_annotations_or_images(tmp_path: Path) -> 
 def test_pose_bins_that_are_none_are_refused(tmp_path: Path) -> None:
     for wrong in (0, 2.5, "side", True):
         with pytest.raises(
-            ValueError, match=r"bin_attribute='pose': want a whole number from 1, annotations\[0\] or"
+            ValueError, match=r"bin_attribute='pose': want a whole number of at least 1, annotations\[0\] or"
         ):
             CocoTarget(tagged(tmp_path, wrong, None), bin_attribute="pose")
     with pytest.raises(

@@ -83,7 +83,7 @@ class Target(ABC):
             ValueError: the camera is unknown.
         """
         raise ValueError(
-            "camera=from_target wants a target with a camera of its own (target=ycb_video, bop, or coco with an "
+            "camera=from_target needs a target with a camera of its own (target=ycb_video, bop, or coco with an "
             f"entry 'camera' in its file), got {type(self).__name__}"
         )
 

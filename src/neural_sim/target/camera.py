@@ -59,7 +59,7 @@ class GivenCamera(CameraSource):
         if (self.width is None) != (self.height is None):
             raise ValueError(f"camera: want width and height or neither, got {self.width} and {self.height}")
         if self.fx is None and any(value is not None for value in (self.fy, self.cx, self.cy)):
-            raise ValueError(f"camera: fy, cx and cy want fx, got fy={self.fy}, cx={self.cx}, cy={self.cy}")
+            raise ValueError(f"camera: fy, cx and cy need fx, got fy={self.fy}, cx={self.cx}, cy={self.cy}")
         if self.fx is not None and self.field_of_view_deg is not None:
             raise ValueError(
                 f"camera: want fx or field_of_view_deg, got {self.fx} and {self.field_of_view_deg}"

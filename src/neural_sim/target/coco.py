@@ -201,7 +201,7 @@ class CocoTarget(AnnotatedPhotographs):
         entry = self._coco.document.get("camera")
         if entry is None:
             raise ValueError(
-                f"{self.source}: camera=from_target wants an entry 'camera' with width, height, fx, fy, cx, cy"
+                f"{self.source}: camera=from_target needs an entry 'camera' with width, height, fx, fy, cx, cy"
             )
         camera = camera_of_entry(entry, f"{self.source}: camera")
         size = {"width": camera.width, "height": camera.height}

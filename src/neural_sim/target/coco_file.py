@@ -59,7 +59,8 @@ def _check_box(value: object, where: str) -> None:
     numbers = value if isinstance(value, list) and all(map(is_number, value)) else []
     if len(numbers) != 4 or numbers[2] < 0 or numbers[3] < 0:
         raise ValueError(
-            f"{where} must be x, y, width, height: four finite numbers, width and height positive, got {value!r:.80}"
+            f"{where} must be x, y, width, height: four finite numbers, width and height not negative, "
+            f"got {value!r:.80}"
         )
 
 
@@ -347,7 +348,7 @@ class CocoFile:
             value = of_image.get(item["image_id"]) if value is None else value
             if value is not None and (type(value) is not int or value < 1):
                 raise ValueError(
-                    f"{where}: want a whole number from 1, annotations[{row}] or its image has {value!r}"
+                    f"{where}: want a whole number of at least 1, annotations[{row}] or its image has {value!r}"
                 )
             bins.append(-1 if value is None else value - 1)
         if all(b < 0 for b in bins):

@@ -158,7 +158,7 @@ class PosedTarget(Photographs):
         sizes = {(other.width, other.height) for other in counted}
         if len(sizes) > 1:
             raise ValueError(
-                f"{self._root}: camera=from_target wants photographs of one size, got {sorted(sizes)}"
+                f"{self._root}: camera=from_target needs photographs of one size, got {sorted(sizes)}"
             )
         if count < len(names):
             _log.warning(
