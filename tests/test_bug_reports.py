@@ -296,7 +296,7 @@ def test_20_a_root_category_is_left_out(tmp_path, caplog):
     out = laid_out("20", tmp_path)
     with caplog.at_level(logging.WARNING):
         assert loaded(out / "labels.json").present.sum() == 6
-    assert "['shelf-objects'] are no objects and have no annotation: left out" in caplog.text
+    assert "['shelf-objects'] are not objects and have no annotation: left out" in caplog.text
 
 
 def test_24_an_opaque_alpha_channel_is_no_mask(tmp_path):

@@ -203,7 +203,7 @@ def test_bad_files_are_refused(root, made):
 
 
 def test_a_class_without_an_object_is_refused_by_its_image(root, made, caplog):
-    with pytest.raises(ValueError, match=r"rgb/000001\.png: shows obj_000001, which is no object"):
+    with pytest.raises(ValueError, match=r"rgb/000001\.png: shows obj_000001, which is not an object"):
         of(root).load([name_of(made[0])], ["obj_000002"], 45, 60)
     with caplog.at_level(logging.INFO):
         left = of(root, unmatched="leave_out").load([name_of(made[0])], ["obj_000002"], SIZE[1], SIZE[0])

@@ -20,7 +20,7 @@ def test_names_stand_for_themselves_unless_they_are_mapped(caplog):
 def test_a_mapping_names_classes_that_there_are():
     classes = ClassMap({"pig": None, "cup": "mug"}, "here", "predict.categories", ("category", "categories"))
     with pytest.raises(
-        ValueError, match=r"^predict\.categories: \['pig'\] are no categories of here, which has \['cup'\]$"
+        ValueError, match=r"^predict\.categories: \['pig'\] are not categories of here, which has \['cup'\]$"
     ):
         classes.check_listed(["cup"])
     classes.check_listed(["pig", "cup", "cow"])
@@ -29,7 +29,7 @@ def test_a_mapping_names_classes_that_there_are():
 def test_what_is_no_object_is_refused_unless_it_is_left_out():
     mapping = {"cup": "mugg", "dog": None}
     refused = (
-        r"^here: classes \['cat', 'cup \(as mugg\)'\] are no objects; objects are .* by target\.classes, "
+        r"^here: classes \['cat', 'cup \(as mugg\)'\] are not objects; objects are .* by target\.classes, "
         r"\{class: object\} or \{class: null\} to leave one out, or set target\.unmatched=leave_out$"
     )
     with pytest.raises(ValueError, match=refused):

@@ -77,14 +77,14 @@ def test_round_trip_through_the_export(tmp_path: Path) -> None:
 
 def test_categories_can_be_renamed_or_left_out(tmp_path: Path) -> None:
     path = write(tmp_path, categories=[{"id": 7, "name": "cup"}, {"id": 8, "name": "dog"}])
-    with pytest.raises(ValueError, match=r"categories \['cup'\] are no objects.*target\.categories"):
+    with pytest.raises(ValueError, match=r"categories \['cup'\] are not objects.*target\.categories"):
         CocoTarget(path).load(NAMES, 80, 80)
     loaded = CocoTarget(path, categories={"cup": "mug", "dog": None}).load(NAMES, 80, 80)
     assert loaded.labels[0].tolist() == [1, 1]
     left_out = CocoTarget(path, categories={"cup": None, "dog": None}).load(NAMES, 80, 80)
     assert not left_out.present.any()
     with pytest.raises(
-        ValueError, match=r"target\.categories: \['cat'\] are no categories of .*annotations\.json"
+        ValueError, match=r"target\.categories: \['cat'\] are not categories of .*annotations\.json"
     ):
         CocoTarget(path, categories={"cup": "mug", "dog": None, "cat": "can"}).load(NAMES, 80, 80)
 
@@ -98,7 +98,7 @@ def test_categories_that_are_no_objects_can_be_left_out(
     with caplog.at_level(logging.INFO):
         loaded = CocoTarget(path, unmatched="leave_out").load(NAMES, 80, 80)
     assert loaded.labels.tolist() == [[1], [-1]]
-    assert "boxes of categories that are no objects left out: {'dog': 2}" in caplog.text
+    assert "boxes of categories that are not objects left out: {'dog': 2}" in caplog.text
 
 
 def test_images_may_lie_elsewhere_and_be_limited(tmp_path: Path) -> None:

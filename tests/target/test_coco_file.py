@@ -276,14 +276,15 @@ def test_categories_without_annotations_are_left_out(made: Made, caplog: pytest.
         assert made.boxes() == PLAIN
         assert made.truth().boxes(made.folder / "000.png")[0].tolist() == PLAIN[0]
     assert (
-        caplog.text.count("categories ['shelf-objects'] are no objects and have no annotation: left out") == 2
+        caplog.text.count("categories ['shelf-objects'] are not objects and have no annotation: left out")
+        == 2
     )
 
 
 def test_categories_with_annotations_that_are_no_objects_are_still_refused(made: Made) -> None:
     made.categories.append({"id": 2, "name": "dog"})
     made.annotations[0]["category_id"] = 2
-    made.refused(r"categories \['dog'\] are no objects")
+    made.refused(r"categories \['dog'\] are not objects")
 
 
 def test_names_of_categories_may_be_numbers(made: Made) -> None:

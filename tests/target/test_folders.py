@@ -79,7 +79,7 @@ def test_a_box_is_the_whole_photograph_and_borders_are_cut_off(tmp_path):
 def test_folders_are_mapped_left_out_or_refused(tmp_path, caplog):
     write(tmp_path, (("cup", 3), ("dog", 2), ("can", 2)))
     with pytest.raises(
-        ValueError, match=r"folders \['cup', 'dog'\] are no objects; .*target\.unmatched=leave_out"
+        ValueError, match=r"folders \['cup', 'dog'\] are not objects; .*target\.unmatched=leave_out"
     ):
         sets_of(FolderTarget(tmp_path))
     kept = FolderTarget(tmp_path, {"cup": "mug", "dog": None})
@@ -137,7 +137,7 @@ def test_the_digest_follows_the_photographs_that_are_taken(tmp_path):
     ("settings", "message"),
     [
         ({"root": "nowhere"}, r"target\.root: no such folder: nowhere; put photographs there"),
-        ({"classes": {"dog": "mug"}}, r"target\.classes: \['dog'\] are no folders of .*\['can', 'mug'\]"),
+        ({"classes": {"dog": "mug"}}, r"target\.classes: \['dog'\] are not folders of .*\['can', 'mug'\]"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path, settings, message):

@@ -190,7 +190,7 @@ def test_every_so_manieth_frame_and_key_frames(root):
 def test_classes_that_are_no_objects(shared_root, caplog):
     names = [FrameName("0000", 1)]
     with pytest.raises(
-        ValueError, match=r"0000/000001-color\.png: shows 025_mug, which is no object; objects are \['d"
+        ValueError, match=r"0000/000001-color\.png: shows 025_mug, which is not an object; objects are \['d"
     ):
         of(shared_root, classes={"035_power_drill": "drill"}).load(names, ["drill"], 45, 60)
     with caplog.at_level(logging.INFO):
@@ -204,10 +204,10 @@ def test_classes_that_are_no_objects(shared_root, caplog):
     )
     mapped = dict.fromkeys(NAMES[1:]) | {NAMES[0]: "drill"}
     assert of(shared_root, classes=mapped).load(names, ["drill"], 45, 60).labels.tolist() == [[0]]
-    with pytest.raises(ValueError, match=r"target\.classes: \['teapot'\] are no classes of"):
+    with pytest.raises(ValueError, match=r"target\.classes: \['teapot'\] are not classes of"):
         of(shared_root, classes={"teapot": None})
     with pytest.raises(
-        ValueError, match=r"target\.classes: \['bore'\] are no objects; objects are \['drill'\]"
+        ValueError, match=r"target\.classes: \['bore'\] are not objects; objects are \['drill'\]"
     ):
         of(shared_root, classes={"035_power_drill": "bore"}).load(names, ["drill"], 45, 60)
 
@@ -234,7 +234,7 @@ def test_several_cameras(root, made, caplog):
     assert focal_lengths(camera)[0] == pytest.approx(MATRIX[0, 0])
     assert "1 of 9 photographs were taken by other cameras" in caplog.text
     Image.fromarray(made[0].image[:60]).save(root / "data/0000/000001-color.png")
-    with pytest.raises(ValueError, match=r"wants photographs of one size, got \[\(120, 60\), \(120, 90\)\]"):
+    with pytest.raises(ValueError, match=r"needs photographs of one size, got \[\(120, 60\), \(120, 90\)\]"):
         of(root).camera()
 
 

@@ -37,7 +37,7 @@ class ClassMap:
         strange = sorted(set(self._named) - set(names))
         if strange:
             raise ValueError(
-                f"{self.key}: {strange} are no {self.kind[1]} of {self.source}, which has {list(names)}"
+                f"{self.key}: {strange} are not {self.kind[1]} of {self.source}, which has {list(names)}"
             )
 
     def object_of(self, name: str) -> str | None:
@@ -72,6 +72,6 @@ class ClassMap:
         if strange and self.unmatched != "leave_out":
             more = "" if self.unmatched is None else ", or set target.unmatched=leave_out"
             raise ValueError(
-                f"{self.source}: {self.kind[1]} {strange} are no objects; objects are {list(objects)}. Map them by "
+                f"{self.source}: {self.kind[1]} {strange} are not objects; objects are {list(objects)}. Map them by "
                 f"{self.key}, {{{self.kind[0]}: object}} or {{{self.kind[0]}: null}} to leave one out{more}"
             )

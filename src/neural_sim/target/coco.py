@@ -261,7 +261,7 @@ class CocoTarget(AnnotatedPhotographs):
         counts = Counter(known[item["category_id"]] for item in self._coco.annotations)
         left_out = {name: counts[name] for name in sorted(strange) if counts[name]}
         if left_out:
-            _log.info("%s: boxes of categories that are no objects left out: %s", self.source, left_out)
+            _log.info("%s: boxes of categories that are not objects left out: %s", self.source, left_out)
 
     @override
     def choose(

@@ -295,7 +295,7 @@ class CocoFile:
         strange = sorted(name for name in idle if classes.object_of(name) not in (None, *objects))
         if strange:
             _log.warning(
-                "%s: categories %s are no objects and have no annotation: left out", self.path, strange
+                "%s: categories %s are not objects and have no annotation: left out", self.path, strange
             )
 
     def by_id(self, labels: Mapping[str, int | None]) -> dict[Any, int | None]:
@@ -338,7 +338,7 @@ class CocoFile:
             attribute: attribute of the annotation, or else of its image; dots lead into nested entries.
 
         Raises:
-            ValueError: a bin is not a whole number from 1, or there is no bin at all.
+            ValueError: a bin is not a whole number of at least 1, or there is no bin at all.
         """
         where = f"{self.path}: target.bin_attribute={attribute!r}"
         of_image = {entry["id"]: _value(entry, attribute) for entry in self.images}

@@ -207,7 +207,7 @@ class PosedTarget(Photographs):
         """
         unknown = sorted({name for name in (self.classes or {}).values() if name} - set(objects))
         if unknown:
-            raise ValueError(f"target.classes: {unknown} are no objects; objects are {list(objects)}")
+            raise ValueError(f"target.classes: {unknown} are not objects; objects are {list(objects)}")
         labels = self._class_map.labels(self.class_names, objects)
         photographs, left_out = [], Counter()
         for name in names:
@@ -215,7 +215,7 @@ class PosedTarget(Photographs):
             left_out.update(self._strange(frame, labels, objects))
             photographs.append(self._photograph(frame, labels, distribution, radii or {}))
         if left_out:
-            _log.info("%s: boxes of classes that are no objects left out: %s", self._root, dict(left_out))
+            _log.info("%s: boxes of classes that are not objects left out: %s", self._root, dict(left_out))
         return read(photographs, height, width, self.minimum_side, self._root)[0]
 
     @property
@@ -227,7 +227,7 @@ class PosedTarget(Photographs):
         strange = [item.name for item in frame.objects if item.name not in labels]
         if strange and self.unmatched == "refuse":
             raise ValueError(
-                f"{frame.image}: shows {strange[0]}, which is no object; objects are {list(objects)}. Map it by "
+                f"{frame.image}: shows {strange[0]}, which is not an object; objects are {list(objects)}. Map it by "
                 "target.classes, {name: object} or {name: null}, or set target.unmatched=leave_out"
             )
         return strange
