@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from neural_sim.gradient.estimators import importance_weights, reinforce, stratified
+from neural_sim.gradient.estimators import across_lights, importance_weights, reinforce, stratified
 
 DOUBLE = torch.float64
 PSI = torch.tensor([0.3, -1.0, 0.8], dtype=DOUBLE)
@@ -116,3 +116,17 @@ def test_reinforce_refuses_nonsense():
         reinforce(SCORES[:1], lambda psi: log_softmax(psi)[:1], PSI)
     with pytest.raises(ValueError, match="log-probabilities"):
         reinforce(SCORES, lambda psi: log_softmax(psi)[:2], PSI)
+
+
+def test_what_a_scene_scores_under_every_light_is_no_error_of_differences_between_lights():
+    lights, scenes = torch.tensor([1.0, -2.0, 4.0]).double(), torch.randn(5, dtype=torch.float64)
+    common = across_lights(lights[:, None] + scenes, 2.0)
+    torch.testing.assert_close(common.value, 2.0 * (lights - lights.mean()))
+    torch.testing.assert_close(
+        common.standard_error, torch.zeros(3, dtype=torch.float64), atol=1e-14, rtol=0.0
+    )
+    table = torch.randn(3, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = across_lights(table, 2.0)
+    differences = 2.0 * (table - table.mean(0))
+    torch.testing.assert_close(found.value, differences.mean(1))
+    torch.testing.assert_close(found.standard_error, differences.std(1) / 5**0.5)
