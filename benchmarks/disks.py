@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import shutil
 import subprocess
 import tempfile
@@ -37,8 +38,8 @@ def disk(folder: Path, size: str) -> Iterator[None]:
         subprocess.run(["umount", "--lazy", folder], check=True)
 
 
-def changed(folder: Path, options: str) -> None:
-    """Mount a disk that is mounted already with other options."""
+def remount(folder: Path, options: str) -> None:
+    """Mount a disk again, with other options."""
     subprocess.run(["mount", "-o", f"remount,{options}", folder], check=True)
 
 
@@ -64,11 +65,11 @@ def trial(
             killed.join(seconds)
             killed.kill()
             killed.join()
-            changed(folder, "ro")
+            remount(folder, "ro")
         process = place.start(log)
         process.join()
         said = log.read_text(errors="replace")
-        changed(folder, f"rw,size={ROOMY}")
+        remount(folder, f"rw,size={ROOMY}")
         right = all(bits.get(name) == bit for name, bit in place.stored().items())
         again = place.start(folder.parent / "again.log")
         again.join()
@@ -87,6 +88,8 @@ def main() -> None:
     parser.add_argument("--read-only", type=int, default=5, help="disks that are read-only after some time")
     parser.add_argument("--out", type=Path, help="a JSON file")
     given, random = parser.parse_args(), Random(0)
+    if os.geteuid() != 0:
+        raise SystemExit("only root may mount disks; run this in a container")
     logging.getLogger("neural_sim.stages.store").setLevel(logging.ERROR)
     trials = []
     with tempfile.TemporaryDirectory(prefix="disks") as folder:
@@ -103,6 +106,7 @@ def main() -> None:
             print(trials[-1], flush=True)
     document = {
         "trials": len(trials), "tracebacks": sum(one["traceback"] for one in trials),
+        "refused": sum(one["status"] == 2 and len(one["said"]) == 1 for one in trials),
         "intact": sum(one["intact"] for one in trials), "same": sum(one["same"] for one in trials), "each": trials,
     }  # fmt: skip
     print(json.dumps({key: value for key, value in document.items() if key != "each"}))

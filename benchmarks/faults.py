@@ -214,7 +214,7 @@ def chains(
                 raise SystemExit(f"a run failed with status {process.exitcode}:\n{place.log[-3000:]}")
         found = place.bits()
         ends.chains += 1
-        wrong = sorted(key for key in {*bits, *found} if bits.get(key) != found.get(key))
+        wrong = _different(bits, found)
         ends.same += not wrong
         ends.different += wrong
         ends.left_running += _running(place.root / "mlflow.db")
@@ -289,6 +289,11 @@ def _flipped(content: bytes, random: Random) -> bytes:
     return content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :]
 
 
+def _different(bits: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
+    """Return the names of results that have other bits, or that only one of the two has."""
+    return sorted(key for key in {*bits, *found} if bits.get(key) != found.get(key))
+
+
 def together(work: Path, bits: Mapping[str, str], count: int) -> dict[str, Any]:
     """Start the command several times at once, on one store and one database."""
     place = Place(work / "together")
@@ -300,11 +305,10 @@ def together(work: Path, bits: Mapping[str, str], count: int) -> dict[str, Any]:
         process.join()
     seconds = time.monotonic() - begun
     runs = [Place(place.root, number) for number in range(1, count + 1)]
-    different = {key for run in runs for key, bit in {**bits, **run.bits()}.items() if bits.get(key) != bit}
-    lost = {key for run in runs for key in bits.keys() - run.bits().keys()}
     return {
         "count": count, "failed": sum(process.exitcode != 0 for process in processes),
-        "different": sorted(different | lost), "seconds": round(seconds, 1),
+        "different": sorted({key for run in runs for key in _different(bits, run.bits())}),
+        "seconds": round(seconds, 1),
         "waits": sum(run.log.count("store: waiting") for run in runs),
         "left_running": _running(place.root / "mlflow.db"),
     }  # fmt: skip

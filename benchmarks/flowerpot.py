@@ -1,4 +1,4 @@
-"""What raises the AP of a detector of a real object that is trained on renders and scored on photographs.
+"""Compare ways to raise the AP on photographs of a real object, of a detector trained on renders of it.
 
 The object is the flowerpot in `<shared>/captures`, reconstructed from its unlabelled photographs, without given cameras
 or masks; five scanned YCB objects are the other classes. Detectors are scored on the labelled photographs in

@@ -1,4 +1,4 @@
-"""From photographs to a detector: with exact poses, with a phone's, and with a phone's after refinement.
+"""Take photographs to a detector: with exact poses, with a phone's, and with a phone's after refinement.
 
 Photographs show three YCB objects over clutter through a distorted lens, with masks and a COLMAP model. Those of a
 phone have poses with errors of 1 % of the distance, and brightness with errors of 10 %. Target images are renders of

@@ -29,7 +29,7 @@ _task: Callable[[Any], Any] | None = None
 
 @dataclass(frozen=True)
 class Work:
-    """What workers do, be they processes on this machine or on the machines of a cluster.
+    """Work for processes on this machine or on the machines of a cluster.
 
     Attributes:
         task: function that is called with each argument. It must be picklable; each worker receives it once.

@@ -75,6 +75,7 @@ def _cluster(work: Work) -> Iterator[Submit]:
 
     def submit(argument: Any) -> Future[Any]:
         result: Future[Any] = Future()
+        # In a list, the task stays a reference, which only a process that lacks it resolves.
         left[result] = handed = remote.remote(place, [task], argument)
         result.add_done_callback(left.pop)
         handed.future().add_done_callback(lambda outcome: _settle(result, outcome))

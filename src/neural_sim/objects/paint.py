@@ -65,7 +65,7 @@ class Paint(Visuals):
 
     @property
     def defined(self) -> bool:
-        """Whether there are colours, which trimesh asks for."""
+        """True if there are colours; trimesh reads this property."""
         return True
 
     @override

@@ -73,12 +73,12 @@ class Comparison:
 
     @property
     def several(self) -> bool:
-        """Whether intervals are over seeds, so that a difference whose interval excludes 0 exceeds their scatter."""
+        """True if intervals are over seeds, so that a difference whose interval excludes 0 exceeds their scatter."""
         return len(self.seeds) > 1
 
     @property
     def timed(self) -> bool:
-        """Whether intervals are over seeds and valid at any time, not only at the end of the runs."""
+        """True if intervals are over seeds and valid at any time, not only at the end of the runs."""
         return self.several and not self.only_at_end
 
     @property

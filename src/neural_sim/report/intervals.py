@@ -33,7 +33,7 @@ class Estimate:
 
     @property
     def certain(self) -> bool:
-        """Whether there is an interval and it excludes 0."""
+        """True if there is an interval and it excludes 0."""
         return self.low is not None and self.high is not None and (self.low > 0.0 or self.high < 0.0)
 
     @property

@@ -103,8 +103,8 @@ def cost_of(finer: Sequence[FieldStage], own: Sequence[FieldStage], results: Res
     Returns:
         A sentence; empty where the store has all finer fields, or where they are the run's own.
     """
-    missing = sum(stage in finer for stage in results.missing(finer))
-    if not missing or list(finer) == list(own):
+    missing = 0 if list(finer) == list(own) else sum(stage in finer for stage in results.missing(finer))
+    if not missing:
         return ""
     steps = finer[0].recipe.steps / own[0].recipe.steps
     pixels = (finer[0].views.settings.image_size / own[0].views.settings.image_size) ** 2

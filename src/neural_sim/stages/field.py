@@ -35,7 +35,7 @@ class FittedField:
 
     @property
     def poor(self) -> bool:
-        """Whether the PSNR is too low for the field to show its object."""
+        """True if the PSNR is too low for the field to show its object."""
         return self.psnr is not None and self.psnr < POOR
 
 

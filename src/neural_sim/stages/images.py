@@ -122,7 +122,7 @@ class Images:
 
     @property
     def renders_target(self) -> bool:
-        """Whether target images are rendered; otherwise they are photographs."""
+        """True if target images are rendered; otherwise they are photographs."""
         return self.experiment.imaging.target.renders
 
     def symmetry(self, name: str, angle: str) -> SymmetryStage:

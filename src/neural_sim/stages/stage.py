@@ -43,7 +43,7 @@ class Stage(ABC, Generic[T]):
 
     @property
     def early(self) -> bool:
-        """Whether the result is made before all others, because the user's data for it may be unusable."""
+        """True if the result is made before all others, because the user's data for it may be unusable."""
         return False
 
     def check(self) -> None:

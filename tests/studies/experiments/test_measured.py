@@ -46,6 +46,12 @@ def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
         UserError, match=r"\(budget\.\S+ was .+ and is gone\); want that scale, or another page"
     ):
         read_measured(file, {"views": BUDGET["views"]})
+    write_measured(file, {}, ROWS)
+    with pytest.raises(UserError, match="another scale \\(it names none\\)"):
+        read_measured(file, BUDGET)
+    file.write_text("{")
+    with pytest.raises(ValueError, match=r"page\.json: not readable as JSON"):
+        read_measured(file, BUDGET)
 
 
 def test_the_cell_names_the_commits():

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from neural_sim.configuration import UserError
-from neural_sim.documents import markdown_table, write_json
+from neural_sim.documents import markdown_table, read_json, write_json
 from neural_sim.report import tracking
 from neural_sim.report.identity import at_scale
 from neural_sim.report.tracking import flatten
@@ -104,18 +103,22 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
     """Read results by row name; empty if the file does not exist.
 
     Raises:
-        UserError: its results are for another ``budget`` (scale); a page
-            holds one scale, so writing it would lose them.
+        UserError: its results are for another ``budget`` (scale); a page holds one scale, so writing it would lose
+            them.
+        ValueError: the file cannot be read as JSON.
     """
     if not file.is_file():
         return {}
-    document = json.loads(file.read_text(encoding="utf-8"))
+    document = read_json(file)
     if not at_scale(document["budget"], budget):
         had, have = flatten(document["budget"]), flatten(budget)
-        key = next(key for key in had if str(had[key]) != str(have.get(key)))
-        now = f"is {have[key]} now" if key in have else "is gone"
+        changes = [
+            f"budget.{key} was {had[key]} and {f'is {have[key]} now' if key in have else 'is gone'}"
+            for key in had
+            if str(had[key]) != str(have.get(key))
+        ]
         raise UserError(
-            f"experiments.page: the results in {file} are for another scale (budget.{key} was {had[key]} and {now}); "
+            f"experiments.page: the results in {file} are for another scale ({(changes or ['it names none'])[0]}); "
             "want that scale, or another page"
         )
     return {name: _row(**row) for name, row in document["rows"].items()}
