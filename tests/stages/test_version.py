@@ -47,7 +47,11 @@ def test_only_what_is_imported_counts(tmp_path, touched):
 
 def test_prose_does_not_count(tmp_path):
     before = code_version(["pack.a"], package(tmp_path / "before", CHAIN))
-    changed = {**CHAIN, "b.py": '"""What."""\n# why\n' + CHAIN["b.py"]}
+    changed = {
+        **CHAIN,
+        "b.py": '"""What."""\n# why\n' + CHAIN["b.py"],
+        "sub/c.py": CHAIN["sub/c.py"] + '"""What the constant means."""\n',
+    }
     assert code_version(["pack.a"], package(tmp_path / "after", changed)) == before
 
 

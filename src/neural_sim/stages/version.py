@@ -104,10 +104,14 @@ def _source(name: str, root: Path) -> Path | None:
 
 
 def _without_docstrings(tree: ast.AST) -> ast.AST:
+    """Drop every statement that is only a string: docstrings, also those below attributes and constants."""
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
-            value = body[0].value
-            if isinstance(value, ast.Constant) and isinstance(value.value, str):
-                node.body = body[1:]  # pyright: ignore[reportAttributeAccessIssue]
+        for name in ("body", "orelse", "finalbody"):
+            body = getattr(node, name, None)
+            if isinstance(body, list):
+                setattr(node, name, [each for each in body if not _is_text(each)])
     return tree
+
+
+def _is_text(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
