@@ -16,7 +16,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from machine import add_device
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.devices import synchronise
 from neural_sim.documents import markdown_table
 from neural_sim.main import build, conf_directory

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mlflow import MlflowClient
 
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.report.tracking import tracking_uri
 
 

@@ -19,7 +19,7 @@ from PIL import Image
 from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_video
 
 from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.detector.settings import Backbone, Head
 from neural_sim.objects.procedural import Procedural
 from neural_sim.synthesis.background import ProceduralClutter

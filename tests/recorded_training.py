@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.optimiser import AdamW
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.protocol import Detector
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
-from neural_sim.detector.trajectory import Recording, train
+from neural_sim.detector.trajectory import AdamW, Recording, train
 from neural_sim.gradient.reversal import Examples, RecordedTraining
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.solver.operator import flatten, unflatten

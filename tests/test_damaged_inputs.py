@@ -26,7 +26,7 @@ from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_vid
 from scipy.spatial.transform import Rotation
 
 from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.saved import DOCUMENT, WEIGHTS, SavedDetector
+from neural_sim.detector.saved_detector import DOCUMENT, WEIGHTS, SavedDetector
 from neural_sim.detector.settings import Anchors, Backbone, Head, Losses
 from neural_sim.masks import read_mask
 from neural_sim.objects.photos import Photos

@@ -12,7 +12,7 @@ from composing import composed
 from PIL import Image
 
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.main import UserError, build, context_of
 from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.tasks.walk import walk

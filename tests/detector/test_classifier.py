@@ -7,14 +7,13 @@ import torch
 from torch.nn import functional as F
 from torchvision.models import resnet18
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.losses import IGNORED
-from neural_sim.detector.module import Optimisation
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.detector.settings import Backbone
-from neural_sim.detector.training import train_detector
+from neural_sim.detector.training import Optimisation, train_detector
 from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import LabelledImages
 

@@ -9,15 +9,14 @@ from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.fcos import FCOS, FCOSHead
 from torchvision.ops import generalized_box_iou_loss
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.fcos import Fcos, generalised_iou
 from neural_sim.detector.losses import BACKGROUND
-from neural_sim.detector.module import Optimisation
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.detector.settings import Backbone, Detections, Head, Points
 from neural_sim.detector.smooth_scores import SmoothAP
-from neural_sim.detector.training import train_detector
+from neural_sim.detector.training import Optimisation, train_detector
 from neural_sim.extras import require
 from neural_sim.solver.operator import flatten, unflatten
 

@@ -5,7 +5,7 @@ import torch
 from colour_detector import ColourDetector
 from torchvision.models import resnet18
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.retinanet import RetinaNet

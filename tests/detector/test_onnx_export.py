@@ -11,7 +11,7 @@ from neural_sim import extras
 from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.onnx_export import TOLERANCE, Decoded, export, largest_difference
 from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.detector.settings import Detections
 
 pytest.importorskip("onnx", reason="the extra onnx is not installed")

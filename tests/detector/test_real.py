@@ -5,10 +5,9 @@ import itertools
 import pytest
 import torch
 
-from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.module import Optimisation
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.real import Real, Sampling, shuffled_passes
-from neural_sim.detector.training import Batches, train_detector
+from neural_sim.detector.training import Batches, Optimisation, train_detector
 from neural_sim.types import LabelledImages
 
 

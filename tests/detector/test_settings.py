@@ -7,12 +7,11 @@ import pytest
 
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.fcos import Fcos
-from neural_sim.detector.module import Optimisation
 from neural_sim.detector.real import Real
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Detections, Head, Losses, Points
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
-from neural_sim.detector.training import Training
+from neural_sim.detector.training import Optimisation, Training
 from neural_sim.detector.trajectory import Recording
 
 THREE = {"strides": (8, 16, 32)}

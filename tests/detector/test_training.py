@@ -4,9 +4,8 @@ import pytest
 import torch
 from torchvision.models import resnet18
 
-from neural_sim.detector.cached import CachedSet, cached_features
-from neural_sim.detector.module import DetectorModule, Optimisation
-from neural_sim.detector.training import train_detector
+from neural_sim.detector.cached_set import CachedSet, cached_features
+from neural_sim.detector.training import DetectorModule, Optimisation, train_detector
 from neural_sim.types import LabelledImages
 
 

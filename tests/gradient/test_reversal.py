@@ -10,9 +10,8 @@ from recorded_training import DOUBLE, EXACT, RATES, RULE, STEP, Micro, extrapola
 
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.fcos import Fcos
-from neural_sim.detector.optimiser import AdamW
 from neural_sim.detector.settings import Backbone, Head
-from neural_sim.detector.trajectory import Recording, train
+from neural_sim.detector.trajectory import AdamW, Recording, train
 from neural_sim.gradient.reversal import Examples, RecordedTraining, reversed_steps
 from neural_sim.gradient.unrolled import ProbeGroups, Unrolled
 from neural_sim.solver.operator import flatten, unflatten

@@ -10,9 +10,8 @@ import torch
 from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 
 from neural_sim.detector.losses import Targets
-from neural_sim.detector.optimiser import AdamW
 from neural_sim.detector.real import shuffled_passes
-from neural_sim.detector.trajectory import train
+from neural_sim.detector.trajectory import AdamW, train
 from neural_sim.gradient.base import ObjectImages, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator, reinforce, stratified
 from neural_sim.gradient.pathwise import PathwiseEstimator

@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_loop import FREE
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.training import Training

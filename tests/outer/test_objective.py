@@ -4,7 +4,7 @@ import pytest
 import torch
 from small_loop import TINY
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neural_sim.baseline.lts import LearningToSimulate
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.real import Real
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head

@@ -4,7 +4,7 @@ import pytest
 import torch
 from retrained import BinnedProblem, contrasts, finite_difference
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.gradient.base import Probes

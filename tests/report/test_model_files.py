@@ -9,7 +9,7 @@ from colour_detector import ColourDetector
 from mlflow import MlflowClient
 from PIL import Image
 
-from neural_sim.detector.saved import SavedDetector, detect
+from neural_sim.detector.saved_detector import SavedDetector, detect
 from neural_sim.report.model_files import log_detector
 from neural_sim.report.tracking import opened
 

@@ -13,7 +13,7 @@ from composing import composed
 from faster_coco_eval import COCO, COCOeval_faster
 from PIL import Image, ImageColor
 
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.main import UserError, context_of
 from neural_sim.report.figures import CLASS_COLOURS
 from neural_sim.tasks.walk import walk

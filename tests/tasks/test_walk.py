@@ -12,7 +12,7 @@ from composing import composed
 from mlflow import MlflowClient
 
 from neural_sim.detector.metrics import evaluate
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.detector.training import train_detector
 from neural_sim.main import UserError, context_of
 from neural_sim.randomness import stream

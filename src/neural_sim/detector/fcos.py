@@ -12,9 +12,8 @@ from torchvision.models.detection.fcos import FCOSClassificationHead, FCOSRegres
 from torchvision.ops import clip_boxes_to_image
 from typing_extensions import override
 
-from neural_sim.detector.backbones import group_norm
 from neural_sim.detector.losses import Targets, assign_points, focal_loss
-from neural_sim.detector.network import fixed_anchors
+from neural_sim.detector.network import fixed_anchors, group_norm
 from neural_sim.detector.on_backbone import ImageSize, PyramidDetector
 from neural_sim.detector.protocol import Outputs
 from neural_sim.detector.settings import (

@@ -17,14 +17,16 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from typing_extensions import override
 
-from neural_sim.detector.backbones import (
+from neural_sim.detector.network import (
     IMAGENET_MEAN,
     IMAGENET_STD,
     PLANS,
     LastStages,
+    NormalisedBackbone,
     build_backbone,
+    build_predictor,
+    initialise,
 )
-from neural_sim.detector.network import NormalisedBackbone, build_predictor, initialise
 from neural_sim.detector.protocol import Detector, Outputs, Parameters
 from neural_sim.detector.settings import ARCHITECTURES, SAVED, Activation, Backbone, Detections, Head
 from neural_sim.ranges import NonNegative, PositiveInt, validated

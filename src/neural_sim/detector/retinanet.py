@@ -10,9 +10,8 @@ from torchvision.models.detection.retinanet import RetinaNetHead
 from torchvision.ops import clip_boxes_to_image
 from typing_extensions import override
 
-from neural_sim.detector.backbones import group_norm
 from neural_sim.detector.losses import IGNORED, Targets, assign_anchors, box_loss, focal_loss
-from neural_sim.detector.network import fixed_anchors
+from neural_sim.detector.network import fixed_anchors, group_norm
 from neural_sim.detector.on_backbone import ImageSize, PyramidDetector
 from neural_sim.detector.protocol import Outputs
 from neural_sim.detector.settings import Activation, Anchors, Backbone, Detections, Head, Losses

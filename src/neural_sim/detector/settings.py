@@ -16,7 +16,7 @@ Activation = Literal["silu", "relu"]
 """Activation of backbone, pyramid and head; relu is torchvision's own."""
 BetweenZeroAndOne = Annotated[float, Gt(0), Lt(1)]
 Normalisation = Literal["group", "none"]
-"""Normalisation of the pyramid and the head, see ``backbones.group_norm``."""
+"""Normalisation of the pyramid and the head, see ``network.group_norm``."""
 BoxLoss = Literal["pseudo_huber", "l1"]
 ARCHITECTURES: dict[Architecture, tuple[int, ...]] = {
     "micro": (8, 16),

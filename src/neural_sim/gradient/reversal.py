@@ -21,8 +21,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.detector.optimiser import pulled_back
-from neural_sim.detector.trajectory import Trajectory
+from neural_sim.detector.trajectory import Trajectory, pulled_back
 from neural_sim.gradient.base import Params
 from neural_sim.solver.operator import flatten, plain_norm, unflatten
 

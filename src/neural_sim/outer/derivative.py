@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.losses import Targets
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, Probes, RenderedPath

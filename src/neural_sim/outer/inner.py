@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.protocol import Detector, Outputs, Parameters
 from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import Training, TrainingHistory, train_detector

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.protocol import Outputs, Parameters
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.solver.hvp import Term

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.real import Real
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.descent import GradientLoop

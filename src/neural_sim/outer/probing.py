@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.losses import Targets
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Probes

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
-from neural_sim.detector.saved import DOCUMENT, WEIGHTS, SavedDetector
+from neural_sim.detector.saved_detector import DOCUMENT, WEIGHTS, SavedDetector
 from neural_sim.extras import require
 from neural_sim.ranges import validated
 from neural_sim.report.tracking import Run

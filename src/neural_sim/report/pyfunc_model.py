@@ -12,7 +12,7 @@ from mlflow.pyfunc import PythonModel  # pyright: ignore[reportPrivateImportUsag
 from PIL import Image
 from typing_extensions import override
 
-from neural_sim.detector.saved import DOCUMENT, SavedDetector, detect
+from neural_sim.detector.saved_detector import DOCUMENT, SavedDetector, detect
 from neural_sim.documents import read_json
 
 COLUMNS = ("image", "label", "score", "x0", "y0", "x1", "y1")

@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.detector.metrics import evaluate, worthless
-from neural_sim.detector.saved import DOCUMENT, SavedDetector, detect
+from neural_sim.detector.saved_detector import DOCUMENT, SavedDetector, detect
 from neural_sim.devices import device_of
 from neural_sim.documents import write_json
 from neural_sim.pictures import check_headers

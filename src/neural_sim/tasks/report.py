@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from typing_extensions import override
 
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.devices import peak_memory_mb, placed
 from neural_sim.documents import write_whole
 from neural_sim.report.coco import write_detections, write_training_set

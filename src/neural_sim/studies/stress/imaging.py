@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neural_sim import cameras
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.parameter.unlearned import Unlearned

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.gradient.base import MixedDerivative, Params
 from neural_sim.gradient.hypergradient import Hypergradient, ImplicitAdjoint
 from neural_sim.gradient.implicit import InnerProblem, hypergradient

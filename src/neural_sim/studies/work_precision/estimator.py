@@ -18,7 +18,7 @@ from annotated_types import Ge, MinLen
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Probes
 from neural_sim.gradient.estimators import Estimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator

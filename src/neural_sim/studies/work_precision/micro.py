@@ -7,10 +7,9 @@ from collections.abc import Callable
 
 import torch
 
-from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.module import Optimisation
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.protocol import Detector
-from neural_sim.detector.training import train_detector
+from neural_sim.detector.training import Optimisation, train_detector
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Params
 from neural_sim.gradient.estimators import importance_weights

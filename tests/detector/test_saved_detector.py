@@ -1,4 +1,4 @@
-"""Model files: a round trip to the bit, detectors from outside the package, and what is refused with file and key."""
+"""Model files: a round trip to the bit, detectors from outside the package, refusals; detections in photographs."""
 
 import dataclasses
 import functools
@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file, save_file
 
-from neural_sim.detector import backbones
+from neural_sim.detector import network
 from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.saved import DOCUMENT, WEIGHTS, SavedDetector, _sha256
+from neural_sim.detector.saved_detector import DOCUMENT, WEIGHTS, SavedDetector, _sha256, detect
 from neural_sim.detector.settings import Backbone
+from neural_sim.target.photographs import letterbox
 from neural_sim.types import PinholeCamera
 
 NAMES = ("can", "mug", "pitcher")
@@ -71,13 +73,13 @@ def test_settings_of_the_constructor_survive(tools, generator, tmp_path):
 def test_pretrained_weights_are_not_read_again(tools, generator, tmp_path, monkeypatch):
     """A backbone with weights has another shape (frozen batch normalisation); the file alone must do for it."""
     weights = tmp_path / "resnet.pt"
-    torch.save(backbones.resnet.resnet18().state_dict(), weights)
+    torch.save(network.resnet.resnet18().state_dict(), weights)
     make = functools.partial(RetinaNet, backbone=Backbone("resnet18", str(weights), freeze=True))
     detector = make(num_classes=3, image_size=(32, 48))
     before = SavedDetector(make, detector.init(generator), NAMES, (32, 48))
     before.save(tmp_path)
     weights.unlink()
-    monkeypatch.setattr(backbones, "load_weights", pytest.fail)
+    monkeypatch.setattr(network, "load_weights", pytest.fail)
     after = SavedDetector.load(tmp_path)
     assert any("running_mean" in name for name in after.params)
     pictures = images(generator)
@@ -226,3 +228,54 @@ def test_parameters_that_do_not_fit_are_refused_by_name(edit, message, folder):
     with pytest.raises(ValueError, match=message) as caught:
         SavedDetector.load(folder)
     assert str(folder / WEIGHTS) in str(caught.value)
+
+
+class Bright:
+    """Finds the box of the pixels above 0.9, and one in the border's corner."""
+
+    def __init__(self, num_classes, image_size):
+        self.image_size = image_size
+
+    def predict(self, params, images, batch_size=64):
+        found = []
+        for image in images:
+            assert image.shape == (3, *self.image_size)
+            rows, columns = (torch.where((image.mean(0) > 0.9).any(axis))[0] for axis in (1, 0))
+            box = [columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]
+            boxes = torch.tensor([[float(side) for side in box], [0.0, 0.0, 3.0, 3.0]])
+            found.append({"boxes": boxes, "scores": torch.tensor([0.9, 0.8]), "labels": torch.tensor([0, 0])})
+        return found
+
+
+def test_boxes_come_back_in_the_photographs_pixels():
+    """Wide, tall, large and small photographs with a white box on black; one detection lies in the border alone."""
+    saved = SavedDetector(Bright, {}, ("box",), (64, 96))
+    for size, box in (
+        ((960, 320), (300, 80, 600, 160)),
+        ((40, 160), (8, 40, 24, 120)),
+        ((24, 8), (6, 2, 12, 4)),
+    ):
+        photo = Image.new("RGB", size)
+        photo.paste((255, 255, 255), box)
+        (found,) = detect(saved, [photo])
+        scale = min(64 / size[1], 96 / size[0])
+        assert found["scores"].tolist() == torch.tensor([0.9]).tolist()
+        # A pixel of the detector's; where it is smaller than the photograph's, enlarging blurs by half of that.
+        assert (found["boxes"][0] - torch.tensor(box)).abs().max() <= max(1.0 / scale, 0.5)
+
+
+def test_the_inverse_of_the_letterbox_is_exact_inside_and_clips_outside(generator):
+    for width, height in ((640, 480), (333, 1000), (7, 5)):
+        _, placing = letterbox(Image.new("RGB", (width, height)), 96, 128)
+        corner = torch.rand(50, 2, generator=generator, dtype=torch.float64)
+        size = torch.tensor([width, height], dtype=torch.float64)
+        boxes = torch.cat(
+            [corner, corner + (1 - corner) * torch.rand(50, 2, generator=generator)], -1
+        ) * size.repeat(2)
+        torch.testing.assert_close(placing.of_photo(placing.boxes(boxes)), boxes, rtol=1e-12, atol=1e-9)
+        outside = placing.of_photo(torch.tensor([[-50.0, -50.0, 500.0, 500.0]]))
+        assert outside.tolist() == [[0.0, 0.0, float(width), float(height)]]
+
+
+def test_no_photographs_give_no_detections():
+    assert detect(SavedDetector(Bright, {}, ("box",), (8, 8)), []) == []

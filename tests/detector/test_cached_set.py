@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached_set import CachedSet
 from neural_sim.types import LabelledImages
 
 
