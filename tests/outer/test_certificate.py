@@ -17,8 +17,7 @@ from neural_sim.outer.certificate import Trust, certify, line, untrusted
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.solver.base import Solution, Status
-from neural_sim.solver.damping import Damped
-from neural_sim.solver.lanczos import Spectrum
+from neural_sim.solver.damping import Damped, Spectrum
 from neural_sim.types import SceneDraw
 
 SPECTRUM = Spectrum(-1.0, 9.0, 0.1, 0.1, 12, True)

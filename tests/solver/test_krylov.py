@@ -9,9 +9,8 @@ import torch
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import Search, Status
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.damping import LanczosDamping
+from neural_sim.solver.damping import LanczosDamping, lanczos
 from neural_sim.solver.direct import Exact
-from neural_sim.solver.lanczos import lanczos
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import Shifted
 

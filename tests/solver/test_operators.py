@@ -11,10 +11,9 @@ import torch
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.damping import FixedDamping, LanczosDamping
+from neural_sim.solver.damping import FixedDamping, LanczosDamping, lanczos, random_start
 from neural_sim.solver.direct import Exact
 from neural_sim.solver.hvp import HessianOperator, gradient
-from neural_sim.solver.lanczos import lanczos, random_start
 from neural_sim.solver.operator import Shifted, columns, flatten, unflatten
 
 DOUBLE = torch.float64

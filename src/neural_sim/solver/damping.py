@@ -1,4 +1,7 @@
-"""The choice of lambda in ``(H + lambda I) v = b``."""
+"""The choice of lambda in ``(H + lambda I) v = b``, by extreme eigenvalues.
+
+They are estimated by the Lanczos process with full reorthogonalisation (Golub and Van Loan, Sec. 10.3).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import abc
 import logging
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, cast
 
 import torch
 from annotated_types import Gt
@@ -16,10 +19,156 @@ from typing_extensions import override
 
 from neural_sim.ranges import NonNegative, NonNegativeInt, Positive, PositiveInt, validated
 from neural_sim.solver.base import Search
-from neural_sim.solver.lanczos import Krylov, Spectrum, lanczos, random_start
-from neural_sim.solver.operator import Matvec
+from neural_sim.solver.operator import (
+    Matvec,
+    NonFiniteProduct,
+    Watched,
+    eigenpairs,
+    in_range,
+    norm,
+    numbers,
+    plain_norm,
+)
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Krylov:
+    """The Krylov space of a start vector b of norm ``size``: orthonormal rows ``basis``, and A in that basis.
+
+    ``beyond`` is the part of the last product outside the space: its norm is the recurrence's next off-diagonal entry.
+    """
+
+    basis: Float[Tensor, "m n"]
+    tridiagonal: Float[Tensor, "m m"]
+    size: float
+    beyond: Float[Tensor, "n"]
+
+    def search(self, shift: float) -> Search | None:
+        """Compute where m conjugate-gradient steps from zero on ``(A + shift I) x = b`` end, without any product.
+
+        Krylov spaces do not depend on the shift. None if the shifted matrix is not positive definite on this space.
+
+        With T the shifted tridiagonal matrix, T y = |b| e_1 and T z = e_m, the value is Q y and its residual r is -y_m
+        times ``beyond``. Q z is the only direction in the space that is conjugate to all earlier ones; hence
+        r + |beyond|^2 y_m Q z is conjugate to the whole space.
+        """
+        shifted = self.tridiagonal + shift * torch.eye(len(self.tridiagonal), dtype=torch.float64)
+        found = cast(tuple[Tensor, Tensor], torch.linalg.cholesky_ex(shifted))  # pyright: ignore[reportUnknownMemberType]
+        factor, info = found
+        if int(info) != 0:
+            return None
+        ends = torch.zeros(len(shifted), 2, dtype=torch.float64)
+        ends[0, 0], ends[-1, 1] = self.size, 1.0
+        weights = torch.cholesky_solve(ends, factor)
+        value, last = weights.T.to(self.basis) @ self.basis
+        residual = -float(weights[-1, 0]) * self.beyond
+        direction = residual + norm(self.beyond) ** 2 * float(weights[-1, 0]) * last
+        search = Search(value, residual, direction)
+        return search if bool(torch.isfinite(torch.stack([value, residual, direction])).all()) else None
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Extreme Ritz values: some eigenvalue lies within ``smallest_error`` of ``smallest`` (likewise the largest).
+
+    ``finite`` is False if the operator returned inf or nan; the values are then those found before (0 if
+    none). ``krylov`` is the space that was searched, None if no product was finite.
+    """
+
+    smallest: float
+    largest: float
+    smallest_error: float
+    largest_error: float
+    products: int
+    finite: bool
+    krylov: Krylov | None = None
+
+    def condition(self, shift: float = 0.0) -> float:
+        """Condition number of A + shift I if the Ritz values show it positive definite; otherwise inf."""
+        low, high = self.smallest + shift, self.largest + shift
+        return high / low if low > 0.0 else math.inf
+
+
+def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
+    """Find extreme Ritz values of a symmetric operator with at most ``steps`` products, from a non-zero ``start``.
+
+    Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue among those whose
+    eigenvectors contribute to the start vector. Memory: ``steps`` vectors.
+
+    Raises:
+        ValueError: the start is zero or not finite, or ``steps`` is below 1.
+    """
+    if steps < 1:
+        raise ValueError(f"lanczos: steps must be at least 1, got {steps}")
+    biggest = float(start.abs().max())
+    if not math.isfinite(biggest) or biggest == 0.0:
+        raise ValueError(
+            f"lanczos: the start vector must be finite and non-zero, its largest entry is {biggest}"
+        )
+    operator = Watched(matvec)
+    vector = start / biggest
+    steps = min(steps, start.numel())
+    basis = start.new_empty(steps, start.numel())
+    basis[0] = vector / norm(vector)
+    alphas: list[float] = []
+    betas: list[float] = []
+    beyond = torch.zeros_like(start)
+    finite = True
+    for step in range(steps):
+        try:
+            applied = operator.measured(basis[step])
+        except NonFiniteProduct:
+            finite = False
+            break
+        product, reach = applied.value, applied.length
+        columns = basis[: step + 1]
+        overlaps = columns @ product
+        product = product - columns.T @ overlaps
+        correction = columns @ product  # twice is enough (Parlett and Kahan)
+        product = product - columns.T @ correction
+        alpha, beta = numbers(overlaps[-1] + correction[-1], plain_norm(product))
+        alphas.append(alpha)
+        betas.append(in_range(beta, product))
+        beyond = product
+        if betas[-1] <= 10.0 * torch.finfo(start.dtype).eps * reach:
+            betas[-1] = 0.0  # an invariant subspace: its Ritz values are eigenvalues
+            beyond = torch.zeros_like(product)
+            break
+        if step + 1 < steps:
+            basis[step + 1] = product / betas[-1]
+    space = basis[: max(len(alphas), 1)]
+    return _extremes(alphas, betas, operator.products, finite, space, beyond, biggest * norm(vector))
+
+
+def random_start(
+    size: int, generator: torch.Generator, *, dtype: torch.dtype, device: torch.device | str = "cpu"
+) -> Tensor:
+    """Draw a Gaussian start vector, which almost surely has a component along every eigenvector."""
+    return torch.randn(size, generator=generator, dtype=dtype, device=generator.device).to(device)
+
+
+def _extremes(
+    alphas: list[float],
+    betas: list[float],
+    products: int,
+    finite: bool,
+    basis: Tensor,
+    beyond: Tensor,
+    size: float,
+) -> Spectrum:
+    if not alphas:
+        return Spectrum(0.0, 0.0, 0.0, 0.0, products, finite)
+    off = torch.tensor(betas[: len(alphas) - 1], dtype=torch.float64)
+    tridiagonal = (
+        torch.diag(torch.tensor(alphas, dtype=torch.float64)) + torch.diag(off, 1) + torch.diag(off, -1)
+    )
+    values, vectors = eigenpairs(tridiagonal)
+    errors = betas[len(alphas) - 1] * vectors[-1].abs()  # residual of a Ritz pair: beta_m |e_m^T y|
+    low, high = float(values[0]), float(values[-1])
+    krylov = Krylov(basis, tridiagonal, size, beyond)
+    return Spectrum(low, high, float(errors[0]), float(errors[-1]), products, finite, krylov)
 
 
 @dataclass(frozen=True)
