@@ -1,1 +1,1 @@
-"""Hypergradient estimators."""
+"""Hypergradients: adjoints (implicit, unrolled), and estimators of the derivative by psi."""

@@ -1,6 +1,7 @@
-"""Inputs and result of the estimators of ``d/dpsi <dL_train/dtheta, v>``.
+"""Inputs and results of the estimators of derivatives by psi.
 
-Estimators leave out the minus sign of the implicit function theorem: ``implicit.py`` applies it once.
+For the implicit adjoint they estimate ``d/dpsi <dL_train/dtheta, v>``, without the minus sign of the implicit function
+theorem, which ``gradient.implicit`` applies. For the unrolled adjoint they estimate ``dL_val/dpsi`` itself.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Params = dict[str, Tensor]
 
 
 class IndexedLoss(Protocol):
-    """Losses of training images by row, computed from cached features of a frozen backbone."""
+    """Losses of images by row, computed from cached features of the frozen backbone."""
 
     def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]:
         """Compute the losses of these rows."""
@@ -28,7 +29,10 @@ class IndexedLoss(Protocol):
 
 
 class ImageLoss(Protocol):
-    """Losses of training images, twice differentiable in parameters and images. Row ``index`` selects the targets."""
+    """Losses of training images, twice differentiable in parameters and images.
+
+    ``index`` holds the images' rows in the training set, which select their targets.
+    """
 
     def __call__(
         self, params: Params, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], /
@@ -39,7 +43,10 @@ class ImageLoss(Protocol):
 
 @dataclass(frozen=True)
 class Probes:
-    """One object's stratified samples: images of every bin of one factor. ``index`` are their rows among all probes."""
+    """One object's stratified samples of one factor: equally many images of every stratum (bin or anchor light).
+
+    ``index`` holds their rows among all probes, ``bins`` the stratum of each.
+    """
 
     index: Int[Tensor, "m"]
     bins: Int[Tensor, "m"]
@@ -60,8 +67,8 @@ class RenderedPath:
 
     ``relaxed`` maps psi to the draw, with its noise fixed. ``render_rays`` maps rays to premultiplied colour [r, 3] and
     opacity [r], differentiable in the rays. ``compose`` maps colour and opacity maps to images, with all other random
-    choices fixed. ``rgb`` and ``opacity`` come from the first render. ``tangents`` (forward mode only) are the
-    derivatives of these maps by those numbers of the draw that depend on psi, from the same render.
+    choices fixed. ``rgb`` and ``opacity`` come from the first render. ``tangents`` come from it as well: derivatives of
+    these maps by the weights of the light and, in forward mode, by the draw's coordinates that depend on psi.
     """
 
     relaxed: Callable[[Float[Tensor, "K"]], SceneDraw]
@@ -75,11 +82,12 @@ class RenderedPath:
 
 @dataclass(frozen=True)
 class ObjectImages:
-    """One object's training images at one psi step.
+    """One object's training images at one psi.
 
-    ``psi`` is the object's psi, all factors of ``distribution`` (p_psi) joined. ``index`` are the images' rows in the
-    training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws). ``draw`` holds
-    the scene parameters they were rendered with. Only the pathwise estimator needs ``images`` and ``path``.
+    ``psi`` is the object's psi, all factors of ``distribution`` (p_psi) joined. ``index`` holds the images' rows in the
+    training set, ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N without photographs). ``draw`` holds
+    the scene parameters with which they were rendered. For the unrolled adjoint, the weights leave photographs out,
+    because each step's batch has its own fraction of them. Only the pathwise estimator needs ``images`` and ``path``.
     """
 
     psi: Float[Tensor, "K"]
@@ -93,11 +101,11 @@ class ObjectImages:
 
 @dataclass(frozen=True)
 class MixedDerivative:
-    """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
+    """One object's derivative by psi, as ``Estimator.estimate`` or ``Estimator.accumulated`` defines it.
 
-    ``standard_error`` is the error of ``value`` over draws of the images at fixed v; inf if unknown. ``p_values`` has,
-    for each factor of psi, the p-value of the null hypothesis that all its components are zero, over the same draws; it
-    is empty if nothing was tested.
+    ``standard_error`` is the error of ``value`` over draws of the images, with v (or the recorded training) fixed; inf
+    if unknown. ``p_values`` has, for each factor of psi, the p-value of the null hypothesis that the derivative by the
+    factor is zero, over the same draws; it is empty if nothing was tested.
     """
 
     value: Float[Tensor, "K"]
@@ -106,7 +114,7 @@ class MixedDerivative:
 
 
 def from_contributions(contributions: Float[Tensor, "n K"]) -> MixedDerivative:
-    """Sum the images' independent contributions, and estimate the standard error of the sum."""
+    """Sum the images' independent contributions, and estimate the standard error of the sum (inf for one image)."""
     value, count = contributions.sum(0), len(contributions)
     if count < 2:
         return MixedDerivative(value, torch.full_like(value, torch.inf))

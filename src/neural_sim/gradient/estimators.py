@@ -1,4 +1,4 @@
-"""Estimators of the derivative by psi from image scores: stratified (the default) and REINFORCE."""
+"""The protocol of estimators, and the two that use image scores: stratified (the default) and REINFORCE."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 
 
 class Estimator(Protocol):
-    """An estimator of the derivative by psi from images.
+    """An estimator of the derivative by psi.
 
     ``wanted`` names the sums over a training's steps that ``accumulated`` reads.
     """
@@ -69,23 +69,23 @@ class Estimator(Protocol):
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """Estimate ``dL_val/dpsi`` of one object through the recorded training, sign included."""
+        """Estimate ``dL_val/dpsi`` of one object from sums over the steps of a recorded training."""
         ...
 
 
 @validated
 @dataclass(frozen=True)
 class StratifiedEstimator:
-    """Stratified sampling: the derivative over hard bins, from the mean scores of probes of every bin of every factor.
+    """Stratified sampling: the derivative over hard bins, from the mean scores of probes in every bin.
 
     With ``E = sum_b p_b s_b`` (s_b the mean score of bin b) the derivative is ``dE/dpsi = sum_b (dp_b/dpsi) s_b``,
     which for logits without a floor is ``p_i (s_i - sum_j p_j s_j)``. Lights use differences of mean scores instead,
     see ``across_lights``.
 
-    Only mean scores are estimated: every bin is sampled separately, whatever p is, and the renderer is never
-    differentiated. Every bin shows the same scenes: all random numbers other than the bin are shared, so that
-    backgrounds and distances cancel in differences between bins. An outer iteration costs one Jacobian-vector product
-    over the predictor for its probes, computed by ``theta_mode`` (see ``gradient.mixed.scores``).
+    Only the mean scores are estimated. Every bin has the same number of probes, however small its p, and the renderer
+    is never differentiated. All bins show the same scenes: everything random except the bin is shared, so that, for
+    example, the backgrounds cancel in differences between bins. With the implicit adjoint, the probes' scores take one
+    Jacobian-vector product, computed as ``theta_mode`` says (see ``gradient.mixed.scores``).
     """
 
     wanted: ClassVar[Wanted] = "probes"
@@ -132,7 +132,7 @@ class StratifiedEstimator:
         distribution = images.distribution
         if set(probes) != set(distribution.names):
             raise ValueError(
-                f"stratified: wants probes of {list(distribution.names)}, which it scores, got {list(probes)}"
+                f"stratified: want probes of every factor, {list(distribution.names)}, got {list(probes)}"
             )
         weight, psi = float(images.weights.sum()), distribution.split(images.psi)
         parts: dict[str, MixedDerivative] = {}
@@ -157,11 +157,11 @@ def stratified(
 ) -> MixedDerivative:
     """Estimate ``weight * dE/dpsi`` from the scores of ``n`` scenes, each rendered with the object in every bin.
 
-    Scenes are independent: the standard error is that of the mean of their derivatives, infinite for a single scene. An
-    offset that a scene adds to its scores in all bins cancels.
+    Scenes are independent, so the standard error is that of the mean of their derivatives (infinite for a single
+    scene). An offset that a scene adds to its scores in all bins cancels.
 
     Raises:
-        ValueError: the table has another shape, or no scene.
+        ValueError: the table does not have one row for each bin, or has no scene.
     """
     if table.ndim != 2 or table.shape[0] != psi.numel() or table.shape[1] == 0:
         raise ValueError(
@@ -175,7 +175,7 @@ def stratified(
 def by_strata(
     scores: Float[Tensor, "n"], factor: Factor, psi: Float[Tensor, "k"], weight: float = 1.0
 ) -> MixedDerivative:
-    """Estimate the derivative by one factor's psi from the scores of its probes, given stratum after stratum.
+    """Estimate the derivative by one factor's psi from the scores of its probes, which are ordered by stratum.
 
     Bins use ``stratified``, lights ``across_lights``.
     """
@@ -186,15 +186,16 @@ def by_strata(
 
 
 def across_lights(table: Float[Tensor, "k n"], weight: float = 1.0) -> MixedDerivative:
-    """Estimate ``weight * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: differences between lights.
+    """Estimate ``weight * (s_i - mean_j s_j)`` from the scores of ``n`` scenes, each under every anchor light.
 
-    What all lights have in common is subtracted, because the projection onto the constraint removes it.
+    s_i is the mean score under light i. The mean over lights is subtracted, because the projection onto the constraint
+    would remove it in any case.
 
-    This is not the derivative of the training loss by psi, whose weights blend the lights in every image
-    (``gradient=pathwise`` computes that one). It is the derivative for another training set: images each under a single
-    light, a fraction w_i of them under light i. The derivative by the blend says little about a large change of light:
-    a detector that never saw a light gains nothing from a trace of it (docs/numerics.md, Lights, compares both with the
-    finite-difference response). ``table`` has the scores of ``n`` scenes under each light.
+    This is not the derivative of the training loss by psi: psi blends the lights in every image, and
+    ``gradient=pathwise`` computes the derivative by that blend. It is the derivative for another training set, in which
+    each image has a single light, and a fraction w_i of the images has light i. The derivative by the blend says little
+    about a large change of light: a detector that never saw a light gains nothing from a trace of it. docs/numerics.md,
+    Lights, compares both with the actual fall of the loss.
 
     Raises:
         ValueError: there is no scene.
@@ -209,7 +210,7 @@ def across_lights(table: Float[Tensor, "k n"], weight: float = 1.0) -> MixedDeri
 def importance_weights(
     probabilities: Float[Tensor, "k"], bins: Int[Tensor, "n"], weight: float = 1.0
 ) -> Float[Tensor, "n"]:
-    """Compute weights ``weight p_b / n_b``, under which images of given bins train as if drawn from p.
+    """Compute weights ``weight p_b / n_b``, with which images of given bins train as if drawn from p.
 
     ``weight`` is the object's fraction of the training set. The weights sum to it if every bin with positive p was
     drawn; the mass of bins that were not drawn is missing, not redistributed.
@@ -226,7 +227,7 @@ def _mean(by_scene: Float[Tensor, "n k"], weight: float) -> MixedDerivative:
 
 
 def _jacobian(log_probabilities: LogProbabilities, psi: Tensor) -> Float[Tensor, "k k"]:
-    """Compute dp_b/dpsi_i, at row b and column i."""
+    """Compute dp_b/dpsi_i, in row b and column i."""
     leaf = psi.detach().requires_grad_()
     with torch.enable_grad():
         p = log_probabilities(leaf).exp()
@@ -236,14 +237,14 @@ def _jacobian(log_probabilities: LogProbabilities, psi: Tensor) -> Float[Tensor,
 @validated
 @dataclass(frozen=True)
 class ReinforceEstimator:
-    """The score function (Williams 1992) on hard draws, with a leave-one-out baseline (Kool et al. 2019)."""
+    """The score-function estimator (Williams 1992) on hard draws, with a leave-one-out baseline (Kool et al. 2019)."""
 
     wanted: ClassVar[Wanted] = "weights"
     chunk_size: PositiveInt = 64
 
     @property
     def draws(self) -> HardDraws:
-        """Exact samples of p_psi that have a density."""
+        """Independent samples of p_psi, with lights drawn around psi's, so that the draws have a density."""
         return HardDraws(explore=True)
 
     @property
@@ -261,7 +262,7 @@ class ReinforceEstimator:
     ) -> MixedDerivative:
         """See ``Estimator``.
 
-        The p-values test the null hypothesis that scores do not depend on the bins, or lights, that a factor drew.
+        The p-values test the null hypothesis that scores do not depend on the bins or lights that were drawn.
         """
         return self._by_score_function(
             scores(losses.cached, params, vector, images.index, self.chunk_size), images
@@ -294,16 +295,16 @@ def reinforce(
 ) -> MixedDerivative:
     """Estimate ``weight * d/dpsi E[s]`` by the mean of ``weight (s_i - b_i) dlog p(V_i)/dpsi`` over independent draws.
 
-    ``b_i`` is the mean of the other draws' scores, hence independent of draw i: the estimate stays unbiased.
-    ``log_prob`` maps psi to the draws' log-probabilities.
+    ``b_i``, the mean of the other draws' scores, is independent of draw i, so the estimate stays unbiased. ``log_prob``
+    maps psi to the draws' log-probabilities.
 
     Raises:
-        ValueError: fewer than 2 draws.
+        ValueError: fewer than 2 draws, or another number of log-probabilities than of draws.
     """
     count = scores.numel()
     if scores.ndim != 1 or count < 2:
         raise ValueError(
-            f"reinforce: a leave-one-out baseline wants at least 2 scores, got shape {tuple(scores.shape)}"
+            f"reinforce: a leave-one-out baseline needs at least 2 scores, got shape {tuple(scores.shape)}"
         )
     advantage = (scores - scores.mean()) * (count / (count - 1))
     leaf = psi.detach().requires_grad_()
@@ -311,7 +312,7 @@ def reinforce(
         log_probabilities = log_prob(leaf)
     if log_probabilities.shape != scores.shape:
         raise ValueError(
-            f"reinforce: got log-probabilities of shape {tuple(log_probabilities.shape)} for {count} scores"
+            f"reinforce: want {count} log-probabilities, as many as scores, got shape {tuple(log_probabilities.shape)}"
         )
     slopes = [
         torch.autograd.grad(entry, leaf, retain_graph=True, materialize_grads=True)[0]

@@ -1,7 +1,6 @@
-"""The hypergradient ``dL_val/dpsi``, and a record of the adjoint that it was computed with.
+"""The hypergradient ``dL_val/dpsi``, and a record of the adjoint with which it was computed.
 
-``gradient.implicit`` computes it at a stationary point (Eq. 2), ``gradient.unrolled`` for the training that was
-run.
+``gradient.implicit`` computes it at a stationary point (Eq. 2), ``gradient.unrolled`` for the training that was run.
 """
 
 from __future__ import annotations
@@ -24,11 +23,12 @@ class ImplicitAdjoint:
     Attributes:
         solution: v, and how the solve ended.
         damping: lambda, and the spectrum from which it was chosen.
-        damping_raises: increases of lambda after solves that met negative curvature.
+        damping_raises: number of increases of lambda after solves that met negative curvature.
         stationarity: ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
         validation_norm: ``|dL_val/dtheta|``.
         sensitivity: ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` for the psi gradients g of all objects joined; None
-            unless the solver was asked for it. This is not a bias: with an indefinite H, g has poles in lambda.
+            if the solver was not asked for it, or g is zero. It does not measure a bias: if H is indefinite, g has
+            poles as a function of lambda.
     """
 
     solution: Solution
@@ -40,7 +40,7 @@ class ImplicitAdjoint:
 
     @property
     def products(self) -> int:
-        """Hessian products of the solve and of the choice of the damping before it."""
+        """Number of Hessian products, of the solve and of the choice of the damping before it."""
         spectrum = self.damping.spectrum
         return self.solution.products + (spectrum.products if spectrum else 0)
 
@@ -51,7 +51,7 @@ class UnrolledAdjoint:
 
     Attributes:
         steps: number of reversed steps; each takes one Hessian product.
-        finite: whether all sums over the steps are finite.
+        finite: whether the sums over the steps are finite for all images and probes.
         validation_norm: ``|dL_val/dtheta|`` after the last step.
     """
 
@@ -77,7 +77,7 @@ class Hypergradient(Generic[Adjoint_co]):
         errors: standard errors of their components.
         adjoint: how it was computed; None if trainings were compared and no adjoint was needed.
         p_values: by object and factor, see ``MixedDerivative``; empty where nothing was tested.
-        seconds: by phase: validation, solve or unrolled, mixed.
+        seconds: time by phase: validation, solve (or unrolled) and mixed.
     """
 
     gradients: dict[str, Float[Tensor, "_"]]

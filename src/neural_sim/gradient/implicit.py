@@ -33,7 +33,7 @@ class Implicit:
 
     Args:
         curvature_images: number of training images in the Hessian products; 0: all.
-        max_residual: largest trusted relative residual of the solve; None here and below: no limit.
+        max_residual: largest trusted relative residual of the solve. None, here and below: no limit.
         max_stationarity: largest trusted ``|dL_train/dtheta|``.
         max_sensitivity: largest trusted relative change from lambda to 2 lambda; needs ``solver.sensitivity``.
     """
@@ -68,15 +68,16 @@ class InnerProblem:
     Attributes:
         params: theta.
         losses: l_i by row.
-        weights: w_i of rows 0..N-1 of ``losses``; 1 / N each for independent draws.
-        chunk_size: images in memory at a time.
-        proximal: weight of the proximal term; with it, ``(H + proximal I)^-1`` is the exact derivative of the problem.
+        weights: w_i of rows 0..N-1 of ``losses``; 1 / N each without photographs.
+        chunk_size: number of images in memory at a time.
+        proximal: weight of the proximal term. With it, the exact implicit derivative has ``(H + proximal I)^-1``, where
+            H is the Hessian of the losses.
         anchor: the fixed theta_0 of the proximal term.
         subset: rows used in Hessian products (the stationarity uses all rows); None: all.
-        subset_weights: weights of those rows; None: their own weights, scaled up to the sum of all.
+        subset_weights: weights of those rows; None: their own weights, scaled to the total of all rows.
 
     Raises:
-        ValueError: no weights, a chunk of no images, or a proximal term that is negative or lacks its anchor.
+        ValueError: no weights, a ``chunk_size`` below 1, or a proximal term that is negative or lacks its anchor.
     """
 
     params: Params
@@ -133,9 +134,9 @@ def hypergradient(
         inner: the inner problem at its minimiser.
         validation: the terms of L_val as functions of the parameters.
         estimates: by object, the function from v to ``d/dpsi <dL_train/dtheta, v>``.
-        solver: solves for v. If it fails, the best iterate is used: read ``adjoint.solution.status``.
-        generator: random numbers of the damping's start vector.
-        previous: initial guess of the solve.
+        solver: solves for v. If it fails, its best iterate is used: check ``adjoint.solution.status``.
+        generator: source of the damping's random start vector, if it needs one.
+        previous: initial guess of v, used if the choice of the damping gives none.
     """
     began = time.perf_counter()
     right_hand_side = gradient(validation, inner.params)
@@ -159,7 +160,7 @@ def hypergradient(
         "mixed": time.perf_counter() - solved,
     }
     return Hypergradient(
-        # The one minus sign of the implicit function theorem: dtheta/dpsi = -(H + lambda I)^-1 d2L_train/dtheta dpsi.
+        # The only minus sign of the implicit function theorem: dtheta/dpsi = -(H + lambda I)^-1 d2L_train/dtheta dpsi.
         gradients={name: -part.value for name, part in mixed.items()},
         errors={name: part.standard_error for name, part in mixed.items()},
         p_values={name: part.p_values for name, part in mixed.items()},
@@ -178,10 +179,10 @@ def hypergradient(
 def curvature_rows(
     drawn: int, weights: Float[Tensor, "N"], wanted: int, generator: torch.Generator
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Choose rows of the training set for Hessian products, and their weights in them.
+    """Choose the rows of the training set that Hessian products use, and weight them.
 
-    ``wanted`` rows are drawn at random (0: all). The first ``drawn`` rows were drawn from p_psi, the others are
-    photographs; both parts are sampled in proportion to their weights, so that each keeps its weight.
+    About ``wanted`` rows are chosen at random (0: all). The first ``drawn`` rows were drawn from p_psi, the others are
+    photographs. Each of the two parts gets rows in proportion to its total weight, which they share equally.
     """
     count = len(weights)
     if not 0 < wanted < count:

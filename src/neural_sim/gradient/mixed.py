@@ -1,7 +1,7 @@
 """The mixed second derivative of the training loss, contracted with v first (paper, Tool 2).
 
-Contracting first leaves one number for each image, its score ``s_i = <dl_i/dtheta, v>``, and one image-sized array,
-``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 3 is never formed.
+Contracting first leaves one number for each image, its score ``s_i = <dl_i/dtheta, v>``, and one array of the images'
+size, ``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 3 is never formed.
 """
 
 from __future__ import annotations
@@ -32,12 +32,11 @@ def scores(
 ) -> Float[Tensor, "n"]:
     """Compute ``s_i = <dl_i/dtheta, v>`` of the images in ``index``, with ``chunk_size`` of them in memory at a time.
 
-    ``forward``: one Jacobian-vector product gives a chunk's scores. ``central_difference``: the losses at
-    ``theta +- h v``, at the cost of two plain passes, where forward mode costs four; its error is of relative order
-    eps^(2/3).
+    ``forward``: one Jacobian-vector product gives a chunk's scores, exactly, at the cost of about four evaluations of
+    its losses. ``central_difference``: two evaluations, at ``theta +- h v``, with an error of relative order eps^(2/3).
 
     Raises:
-        ValueError: an unknown mode, or a chunk of no images.
+        ValueError: an unknown mode, or a ``chunk_size`` below 1.
     """
     _check(mode, chunk_size)
     along = _ALONG[mode]
@@ -57,12 +56,12 @@ def image_cotangents(
     weights: Float[Tensor, "n"],
     chunk_size: int = 16,
 ) -> Float[Tensor, "n 3 h w"]:
-    """Compute ``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the images' cotangents (left factor of Eq. 3 times v).
+    """Compute ``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the images' cotangents (v times the first factor of Eq. 3).
 
     The inner derivative, by theta, is taken in forward mode; the outer one, by the images, in reverse mode.
 
     Raises:
-        ValueError: a chunk of no images.
+        ValueError: a ``chunk_size`` below 1.
     """
     _check("forward", chunk_size)
     if not len(index):
@@ -109,7 +108,7 @@ _ALONG = {"forward": _forward_scores, "central_difference": _differenced_scores}
 
 
 def _device(params: Params) -> torch.device:
-    """Find the device of the losses. Rows and weights, which are on the CPU, are moved there once."""
+    """Find the device of the losses, to which rows and weights are moved from the CPU once."""
     return next(iter(params.values())).device
 
 

@@ -1,11 +1,10 @@
 """The paper's estimator: relaxed draws, differentiated through the renderer (Sec. 3.1, Tools 1 to 3, Eqs. 3 to 6).
 
 Reverse mode is the paper's. The first forward pass renders images without derivatives; then v and the images'
-cotangents are computed. The second forward pass renders rays of the same draw, one patch at a time, each followed by
-its backward pass into the few numbers that the draw has for each image. Forward mode uses that an image has thousands
-of numbers and V only a few: the first render also computes the maps' derivatives by those few, and the cotangents are
-contracted with them, without a second render or patches. In both modes the draw is differentiated by psi once, at the
-end.
+cotangents are computed. The second forward pass renders the rays of the same draw patch by patch; after each patch, a
+backward pass adds to the derivatives by V, a few numbers for each image. Forward mode needs neither a second render nor
+patches: because V has only a few numbers, the first render also computes the derivatives of the images by each, and the
+cotangents are contracted with them. In both modes the draw is differentiated by psi once, at the end.
 """
 
 from __future__ import annotations
@@ -49,13 +48,13 @@ class PathwiseEstimator:
     """Relaxed draws, differentiated through the renderer.
 
     Args:
-        mode: how images are differentiated by V. ``forward``: during the first render; ``reverse``: the paper's
+        mode: how images are differentiated by V. ``forward``: during the first render; ``reverse``: by the paper's
             second forward pass, patch by patch.
         patch_size: number of rays in a patch of the reverse mode.
-        chunk_size: images whose losses are differentiated at a time.
+        chunk_size: number of images whose losses are differentiated at a time.
 
     Raises:
-        ValueError: any of these out of its range, with the key and the value.
+        ValueError: any of these is out of its range; the message has the key and the value.
     """
 
     wanted: ClassVar[Wanted] = "inputs"
@@ -83,11 +82,10 @@ class PathwiseEstimator:
     ) -> MixedDerivative:
         """See ``Estimator``.
 
-        Both modes use the tangents of the first render. p-values come from ``significance.zero_mean`` of the images'
-        contributions.
+        p-values come from ``significance.zero_mean`` of the images' contributions.
 
         Raises:
-            ValueError: images without a path.
+            ValueError: the images have no path.
         """
         path = _path(images)
         cotangents = image_cotangents(
@@ -115,7 +113,7 @@ class PathwiseEstimator:
         maps = map_cotangents(path, cotangents)
         along_draw = contract(path.tangents or {}, maps)
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
-            # The first render always computes derivatives by the lights, but those by the camera only in forward mode.
+            # The first render always computes derivatives by the lights, but only in forward mode those by coordinates.
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
         # From here on there are only a few numbers per image; they are on the CPU, like psi and the draws.
         along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
@@ -128,7 +126,7 @@ class PathwiseEstimator:
 
 def _path(images: ObjectImages) -> RenderedPath:
     if images.path is None:
-        raise ValueError("pathwise: these images carry no rendered path to differentiate")
+        raise ValueError("pathwise: these images have no rendered path to differentiate")
     return images.path
 
 
@@ -150,7 +148,8 @@ def draw_cotangents(
 ) -> dict[str, Float[Tensor, "n"]]:
     """Compute cotangents of the draw's coordinates: the second forward and the only backward pass (Tools 2, 3).
 
-    Only ``patch_size`` rays are in memory. Pixels whose cotangent is exactly zero are skipped, without any error.
+    Only ``patch_size`` rays are in memory at a time. Pixels whose cotangent is exactly zero contribute nothing and are
+    skipped.
     """
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
@@ -172,7 +171,7 @@ def draw_cotangents(
 
 
 def contract(tangents: Mapping[str, Maps], maps: Maps) -> dict[str, Float[Tensor, "n"]]:
-    """Contract each image's tangents with its maps' cotangents, which gives the cotangents of the draw's numbers."""
+    """Contract each image's tangents with its maps' cotangents, to give the cotangents of the draw's numbers."""
     return {
         name: (tangent.rgb * maps.rgb).sum((1, 2, 3)) + (tangent.opacity * maps.opacity).sum((1, 2))
         for name, tangent in tangents.items()
@@ -184,10 +183,10 @@ def psi_contributions(
     psi: Float[Tensor, "K"],
     cotangents: Mapping[str, Float[Tensor, "n"]],
 ) -> Float[Tensor, "n K"]:
-    """Compute each image's contribution to the derivative by psi: its draw's cotangents through Tool 1's relaxed draw.
+    """Compute each image's contribution to the derivative by psi, by pulling cotangents back through Tool 1's draw.
 
     Rows sum to the vector-Jacobian product; the standard error needs them separately. psi has fewer numbers than there
-    are images, so that forward mode, with one pass for each number, is the cheaper way to all rows.
+    are images, so forward mode, with one pass for each number of psi, is the cheaper way to compute all rows.
     """
 
     def along(psi: Tensor) -> Tensor:

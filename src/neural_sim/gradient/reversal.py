@@ -3,12 +3,12 @@
 The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. Let lambda_t be the derivative of
 L_val by the state before step t (theta and the optimiser's moments). Going back one step computes
 
-    a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
-    lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
+    a_t       lambda_{t+1}, pulled back through the step onto its batch's gradient,
+    lambda_t  lambda_{t+1}, pulled back through the step onto its state, plus ``H_t a_t`` in theta,
 
-where H_t is the Hessian of the batch's loss at theta_t. An image of weight w in that loss has
-``dL_val/dw = <dl/dtheta, a_t>``. This score, summed over the steps, replaces ``-<dl/dtheta, v>``, minus sign included
-(Baydin and Pearlmutter 2014; Maclaurin et al. 2015; here states are stored, not recomputed backwards).
+where H_t is the Hessian of the step's objective at theta_t. An image of weight w in that objective has
+``dL_val/dw = <dl/dtheta, a_t>``. This score, summed over the steps, takes the place of ``-<dl/dtheta, v>``, minus sign
+included (Baydin and Pearlmutter 2014; Maclaurin et al. 2015; here states are stored, not recomputed backwards).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from neural_sim.solver.operator import flatten, plain_norm, unflatten
 
 Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
 Wanted = Literal["probes", "weights", "inputs"]
-"""Which sums an estimator reads: the probes' scores only; also derivatives by the training images' weights; or also
-those by the images' inputs."""
+"""Which sums an estimator reads: ``probes``: the probes' scores only; ``weights``: also derivatives by the training
+images' weights; ``inputs``: also those by the images' inputs."""
 InputsOf = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 """Computes a training's inputs from images and their rows."""
 
@@ -50,13 +50,14 @@ class Examples:
     Each step's objective is its batch's mean loss plus ``proximal / 2 |theta - anchor|^2``.
 
     Attributes:
-        inputs: the tensors by which losses are differentiated where images change with psi, each [N, ...].
+        inputs: what losses are computed from, tensors [N, ...]; where images change with psi, losses are differentiated
+            by them.
         losses: computes losses of rows from their inputs.
         proximal: weight of the proximal term.
         anchor: the fixed theta_0 of the proximal term.
         inputs_of: computes the inputs from images and their rows.
-        drawn: number of rows, the first ones, that were drawn from p_psi; the others (photographs) do not depend on it.
-            None: all rows.
+        drawn: how many rows were drawn from p_psi. They come first; the others are photographs, which do not depend on
+            psi. None: all rows.
 
     Raises:
         ValueError: a proximal term that is negative or lacks its anchor.
@@ -130,7 +131,7 @@ class ReversedStep:
         params: theta before the step.
         along: a_t.
         rows: the rows of its batch.
-        scores: <dl/dtheta, a_t> of the batch's images; empty unless wanted.
+        scores: <dl/dtheta, a_t> of the batch's images; may be empty if only probes are wanted.
         inputs: derivative of the mean score by the inputs of these rows; empty unless wanted.
     """
 
@@ -144,7 +145,7 @@ class ReversedStep:
 
 @dataclass(frozen=True)
 class _Curved:
-    """A batch's curvature along a: ``product`` is H a; the other fields are as in ``ReversedStep``."""
+    """A batch's curvature along a_t: ``product`` is ``H_t a_t``; the other fields are as in ``ReversedStep``."""
 
     product: Float[Tensor, "n"]
     scores: Float[Tensor, "_"]
@@ -164,15 +165,15 @@ def reversed_steps(
         training: the training.
         slope: ``dL_val/dtheta`` after its last step.
         product: how a batch's Hessian is multiplied. ``forward_difference``: the gradient at ``theta + h a`` minus the
-            step's recorded gradient, with relative error eps^(1/2), if only probes are wanted (else like
-            ``central_difference``); ``central_difference``: two gradients at ``theta +- h a``, with relative error
-            eps^(2/3); ``reverse_over_reverse``: exact, for the time of three and a half gradients and the memory of a
-            second derivative.
-        wanted: what each step computes.
-        floor: the fraction passed to ``detector.optimiser.Rule.floored``; at 0 the derivative is the training's own.
+            step's recorded gradient, with relative error eps^(1/2), if only probes are wanted (otherwise like
+            ``central_difference``). ``central_difference``: two gradients, at ``theta +- h a``, with relative error
+            eps^(2/3). ``reverse_over_reverse``: exact, in the time of three and a half gradients and with the memory of
+            a second derivative.
+        wanted: which sums the estimator reads.
+        floor: the fraction passed to ``detector.optimiser.AdamW.floored``; at 0 the derivative is exact.
 
     Raises:
-        ValueError: an unknown product, or a slope whose length is not theta's.
+        ValueError: an unknown product, or a slope that does not have theta's length.
     """
     trajectory, examples, like = training.trajectory, training.examples, training.params
     if product not in get_args(Product):
@@ -229,7 +230,7 @@ def _doubly_reversed(
 def _differenced(
     examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
 ) -> _Curved:
-    """Take central differences of losses and gradients, without waiting for a device."""
+    """Take central differences of losses and gradients, without waiting for the device."""
     unit, scale = _displacement(theta, along, torch.finfo(theta.dtype).eps ** (1 / 3))
     inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
     sides: list[tuple[Tensor, ...]] = []
@@ -247,20 +248,20 @@ def _differenced(
 def _from_one_side(
     examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, at_theta: Tensor
 ) -> _Curved:
-    """Take the forward difference of gradients; ``at_theta`` is the gradient at theta, recorded by the training."""
+    """Take the forward difference of gradients; ``at_theta`` is the gradient of the batch's mean loss at theta."""
     # Rounding and third derivatives contribute about equally at eight times the root of eps.
     unit, scale = _displacement(theta, along, 8 * torch.finfo(theta.dtype).eps ** 0.5)
     leaf = (theta + unit).detach().requires_grad_()
     with torch.enable_grad():
         loss = examples.losses(unflatten(leaf, like), examples.of(rows), rows).mean()
-    (beside,) = torch.autograd.grad(loss, leaf)
-    return _Curved((beside - at_theta) * scale, theta.new_zeros(0), ())
+    (ahead,) = torch.autograd.grad(loss, leaf)
+    return _Curved((ahead - at_theta) * scale, theta.new_zeros(0), ())
 
 
 def _displacement(theta: Tensor, along: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """Return the vector h a of length ``reach`` (1 + RMS of theta), and 1 / h, without waiting for the device.
+    """Return the vector h a, of length ``reach`` times (1 + RMS of theta), and 1 / h, without waiting for the device.
 
-    All differences are zero if a is 0.
+    If a is 0, h a is 0 as well, so that differences along it vanish.
     """
     size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
     length = reach * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)

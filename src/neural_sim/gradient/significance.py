@@ -1,12 +1,12 @@
-"""Whether a derivative can be told from zero: p-values for all components of one factor of psi together.
+"""Tests whether a derivative differs from zero: one p-value for all components of a factor of psi together.
 
-The statistic is ``Q = sum_j (sum_i c_ij)^2 / sum_i c_ij^2``, where c are the images' contributions to the derivative.
-Each component is divided by its own variance, so that bins with scattered scores and rare bins weigh no more than
-others; an image that is alone in its bin adds about 1 to Q whatever its score. The distribution of Q under the null
-hypothesis comes from resampling: the data are changed at random in ways that the null allows. The p-value is the
-fraction of samples, the data themselves included, whose Q is at least that of the data. If the changes leave the
-distribution of the scores invariant, the level is exact whatever that distribution is (Phipson and Smyth 2010). The
-random changes are the same in every call.
+The statistic is ``Q = sum_j (sum_i c_ij)^2 / sum_i c_ij^2``, where c_ij is image i's contribution to component j of the
+derivative. Each component is divided by its own variance, so that bins with scattered scores and rare bins weigh no
+more than others; an image that is alone in its bin adds about 1 to Q whatever its score. The distribution of Q under
+the null hypothesis comes from resampling: the data are changed at random in ways that should not matter if the
+hypothesis holds. The p-value is the fraction of samples, including the data themselves, whose Q is at least that of the
+data. If the changes leave the distribution of the scores invariant, the level is exact whatever that distribution is
+(Phipson and Smyth 2010). The random changes are the same in every call.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
     """Test that independent ``rows`` have mean zero, by random changes of their signs; return the p-value.
 
     The test is exact for rows symmetric about zero, whatever their tails, their variances and the dependence between
-    their components. Rows of zeros add nothing: with m others the p-value is at least about 2^(1 - m). It is 1 for rows
-    that are not finite.
+    their components. Rows of zeros add nothing: with m other rows, the p-value is at least about 2^(1 - m). It is 1 if
+    all rows are zero, or if a value is not finite.
     """
     rows = _scaled(rows.double())
     if not bool(rows.any()):
@@ -47,14 +47,14 @@ def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
 def no_association(scores: Float[Tensor, "n"], drawn: Num[Tensor, "n k"], draws: int = DRAWS) -> float:
     """Test that images' ``scores`` have the same mean whatever was ``drawn`` for them; return the p-value.
 
-    ``drawn`` holds the bin, as a row of zeros and a one, or numbers. The contributions
+    ``drawn`` holds each image's bin, one-hot, or other numbers that were drawn. The contributions
     ``(s_i - mean s)(d_i - mean d)`` are changed at random.
 
     The result is the larger of two p-values, so that the level holds if either test's condition does. Permuting the
-    scores over the images is exact if scores do not depend on what was drawn, for any law of the scores, any skewness
-    and any number of images. Changing signs (``zero_mean``) covers bins whose scores scatter differently, if scores
-    scatter symmetrically. Asymptotically each test holds without its condition (Chung and Romano 2013, for permutations
-    of such a statistic). The result is 1 for numbers that are not finite.
+    scores over the images is exact if scores do not depend on what was drawn, whatever their distribution, its
+    skewness and the number of images. Changing signs (``zero_mean``) covers bins whose scores scatter differently, if
+    they scatter symmetrically. Asymptotically each test holds without its condition (Chung and Romano 2013, for
+    permutations of such a statistic). The result is 1 if a number is not finite.
     """
     residuals, drawn = _centred(scores.double()), _centred(drawn.double())
     flipped = zero_mean(residuals[:, None] * drawn, draws)
@@ -71,14 +71,14 @@ def no_association(scores: Float[Tensor, "n"], drawn: Num[Tensor, "n k"], draws:
     return max(flipped, _p_value(observed, changed, draws))
 
 
-def no_difference(scores: Float[Tensor, "scenes lights"], draws: int = DRAWS) -> float:
-    """Test that the same scenes have the same mean score under every light; return the p-value.
+def no_difference(scores: Float[Tensor, "scenes strata"], draws: int = DRAWS) -> float:
+    """Test that the same scenes have the same mean score in every stratum (bin or light); return the p-value.
 
     Each scene's deviations from its mean score are changed at random.
 
-    The result is the larger of two p-values, as in ``no_association``. Permuting each scene's scores among the lights
-    is exact if a scene's scores differ by chance alone, for any law; changing signs covers lights under which scores
-    scatter differently.
+    The result is the larger of two p-values, as in ``no_association``. Permuting each scene's scores among the strata
+    is exact if a scene's scores differ by chance alone, whatever their distribution; changing signs covers strata in
+    which scores scatter differently.
     """
     apart = scores.double() - scores.double()[:, :1]
     rows = _scaled((apart - apart.mean(-1, keepdim=True)).flatten()).view_as(apart)
@@ -119,7 +119,7 @@ def _centred(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
 def _scaled(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
     """Divide each component by its largest absolute value, so that no square over- or underflows.
 
-    A component with a value that is not finite becomes zeros.
+    If any value is not finite, the result is zeros.
     """
     if not bool(values.isfinite().all()):
         return torch.zeros_like(values)

@@ -1,7 +1,7 @@
 """The hypergradient of the training that was actually run.
 
-``gradient.reversal`` reverses its steps. Estimators read sums over these steps: scores of images and probes,
-and derivatives by the training's inputs.
+``gradient.reversal`` reverses its steps. Estimators read sums over these steps: scores of images and probes, and
+derivatives by the training's inputs.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Accumulated:
     """Sums over the reversed steps; for a_t see ``gradient.reversal``.
 
     Attributes:
-        images: derivatives of L_val by the training images' weights (1 each in the mean of a batch); empty unless
-            wanted.
+        images: derivatives of L_val by the training images' weights, with which each image counts in the mean over its
+            batch (1 in the training that was run); empty unless wanted.
         inputs: derivatives by the training images' inputs; empty unless wanted.
         probes: each probe's score, estimated from the steps that scored it. The mean over the probes of a bin is
             unbiased for ``sum_t f_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group; f_t is
@@ -79,7 +79,7 @@ class Accumulated:
             leaf = chunk.detach().requires_grad_()
             with torch.enable_grad():
                 inputs = self.inputs_of(leaf, rows)
-            # Box targets do not depend on the image.
+            # Box targets do not depend on the image, and have no gradient.
             moved = [
                 (x, pulled[rows]) for x, pulled in zip(inputs, self.inputs, strict=True) if x.requires_grad
             ]
@@ -94,11 +94,11 @@ class ProbeGroups:
 
     Attributes:
         losses: losses of probes by row.
-        groups: tables [strata, per_bin] of rows. Each holds one object's images of one factor's bins, or of the same
-            scenes (columns) under each light. All have the same number of columns.
+        groups: tables [strata, per_bin] of rows. Each table holds one object's probes of one factor: its rows are bins
+            or lights, its columns scenes. All tables have the same number of columns.
 
     Raises:
-        ValueError: the tables have other shapes.
+        ValueError: a table is not two-dimensional or has no column, or numbers of columns differ.
     """
 
     losses: IndexedLoss
@@ -108,7 +108,7 @@ class ProbeGroups:
         widths = {table.shape[-1] for table in self.groups}
         if len(widths) != 1 or 0 in widths or any(table.ndim != 2 for table in self.groups):
             shapes = [tuple(table.shape) for table in self.groups]
-            raise ValueError(f"probes: want tables [strata, per_bin] of one per_bin above 0, got {shapes}")
+            raise ValueError(f"probes: want tables [strata, per_bin] of the same per_bin >= 1, got {shapes}")
 
     @property
     def per_bin(self) -> int:
@@ -130,11 +130,13 @@ class Unrolled:
         product: how a batch's Hessian is multiplied, see ``gradient.reversal.reversed_steps``.
         part: fraction of the steps that are reversed, counted from the end; 1 is exact.
         max_memory_mb: memory limit of the recorded training, see ``detector.trajectory.Recording``.
-        probes_per_step: number of probes of every bin that a step scores, in a shuffled cycle over all; 0: all of them.
-            At one, the choice of probes is most of a derivative's variance (docs/numerics.md, Noise of a derivative).
-        scored_steps: approximate number of steps that score probes; 0: all. A longer training is divided into blocks;
-            in each block one random step scores probes, with the block's weight, see ``step_weights``. More objects
-            have more probes and more steps: if all were scored, the cost would grow with the square of their number.
+        probes_per_step: number of probes of every bin that a step scores, in shuffled passes over all of them; 0: all.
+            At 1, most of a derivative's variance comes from the choice of probes and of validation images
+            (docs/numerics.md, Noise of a derivative).
+        scored_steps: approximate number of steps that score probes; 0: all. A longer training is divided into blocks.
+            In each block one random step scores probes, with the block's weight, see ``step_weights``. More objects
+            mean more probes and more steps: if every step scored probes, the cost would grow with the square of the
+            number of objects.
         chunk_size: number of probes whose losses are computed at a time.
         floor: smallest denominator allowed for an entry of theta in AdamW's steps, as a fraction of what is usual for
             the entry and its tensor, see ``detector.optimiser.AdamW.floored``; 0 is exact.
@@ -154,7 +156,7 @@ class Unrolled:
         return Recording(self.part, self.max_memory_mb)
 
     def doubts(self, adjoint: UnrolledAdjoint) -> list[str]:
-        """Name the reasons not to trust a reversed training."""
+        """Name the conditions that a reversed training fails: ``solver`` if it is not ``finite``."""
         return [] if adjoint.finite else ["solver"]
 
     def derivative(
@@ -172,7 +174,7 @@ class Unrolled:
             training: the training.
             validation: the terms of L_val as functions of the parameters.
             estimates: by object, its estimator as a function of the sums over the steps.
-            generator: random numbers that choose steps and probes.
+            generator: source of the random numbers that choose steps and probes.
             wanted: which sums the estimators read.
             probes: the probes that the steps score.
         """
@@ -247,9 +249,9 @@ class _Scoring:
         parts = torch.split(along, [part.numel() for part in rows])
         means = [part.mean() for part in parts]
         scale = weight * self.per_bin / len(columns)
-        # An offset common to a group has no effect, but it adds noise if probes are scored unequally often. The offset
-        # that is subtracted comes from the previous step: the mean of these same scores would correlate with their
-        # noise.
+        # An offset common to a group has no effect, but it adds noise if probes are scored unequally often. It is
+        # estimated from the previous scored step, because the mean of these same scores would correlate with their
+        # noise; only the first scored step uses its own mean.
         for into, part, level in zip(rows, parts, self._levels or means, strict=True):
             self.total.index_add_(0, into, scale * (part - level))
         self._levels, self.scored = means, self.scored + len(along)
