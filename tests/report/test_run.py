@@ -64,7 +64,7 @@ def test_what_the_target_shows_is_in_the_results_the_summary_and_the_history(res
     read = dataclasses.replace(results, records=[], shown=(one,))
     held = json.loads(write_results(read, tmp_path).read_text())
     assert held["shown"][0]["low"] == [0.7, 0.0, 0.0, 0.0] and held["shown"][0]["finding"] == "moves"
-    assert "your target shows the a from pose bin 1 (0.70 to 0.90)" in read.summary()
+    assert "your target shows the a in pose bin 1 (0.70 to 0.90)" in read.summary()
     assert [history[0] for history in read.learned[0].history] == [0.25, 0.85]
     # A loop that ended after its first step: its one record is of the training there.
     record = {

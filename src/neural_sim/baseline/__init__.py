@@ -1,1 +1,1 @@
-"""Methods to compare with: each chooses distributions of training images without the hypergradient."""
+"""The methods that choose psi: Neural-Sim, and those with which it is compared."""

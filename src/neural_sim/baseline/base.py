@@ -1,4 +1,4 @@
-"""Methods that learn psi from rewards, and the settings of all other methods."""
+"""The interface of methods that learn psi from rewards, and the settings of methods that are implemented elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neural_sim.ranges import PositiveFraction, validated
 
 
 class Search(Protocol):
-    """A run of such a method: ``ask`` for psi, train a detector on its images, ``tell`` the reward."""
+    """A run of a method with rewards: ``ask`` for psi, train a detector on its images, ``tell`` the reward."""
 
     @property
     def psi(self) -> Float[Tensor, "objects K"]:
@@ -23,18 +23,18 @@ class Search(Protocol):
         ...
 
     def ask(self) -> Float[Tensor, "objects K"]:
-        """Ask for the psi whose images come next."""
+        """Return the psi for the next training images."""
         ...
 
     def tell(self, reward: float, by_object: Float[Tensor, "objects"]) -> None:
         """Record the reward of a detector trained on images at the psi last asked for; larger is better.
 
-        ``by_object`` is its score on each object's class, 0 for classes that validation images do not show.
+        ``by_object`` is its score on each object's class, nan for classes that validation images do not show.
         """
         ...
 
     def state(self) -> dict[str, Any]:
-        """Return what it has learned, without its generator, so that an interrupted run can resume."""
+        """Return what the run has learned, without its generator, so that an interrupted run can resume."""
         ...
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -43,7 +43,7 @@ class Search(Protocol):
 
 
 class RewardMethod(Protocol):
-    """A configured method. Each outer iteration of the budget has ``rounds`` of drawing, training and reward."""
+    """A configured method with rewards. For each outer iteration in the budget, it has ``rounds`` trainings."""
 
     name: str
     rounds: int
@@ -67,7 +67,7 @@ class Fixed:
 @validated
 @dataclass(frozen=True)
 class HypergradientLoop:
-    """Steps of psi by the hypergradient with the configured estimator: Neural-Sim, or Auto-Sim with ``reinforce``."""
+    """Steps of psi along the hypergradient: Neural-Sim or, with ``gradient=reinforce``, Auto-Sim."""
 
     name: str
 
@@ -75,9 +75,10 @@ class HypergradientLoop:
 @validated
 @dataclass(frozen=True)
 class Response:
-    """Steps of psi by the finite-difference response of training, without a derivative (``outer.response``).
+    """Steps of psi along the finite-difference response of training, without a derivative (``outer.response``).
 
-    It takes one training for each bin, in which ``part`` of every object's images moves to that bin.
+    The response takes one training for each bin of a factor, in which every object moves the fraction ``part`` of its
+    images to one bin.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """Learning to Simulate (Ruiz, Schulter and Chandraker 2019): REINFORCE on the rewards of simulator settings.
 
-The policy is a Gaussian over psi with a learned mean omega and fixed deviations. A setting drawn from it makes one data
-set, on which one detector is trained; its score on the target set is the setting's reward. After every ``samples``
-settings, omega steps along ``mean_k (R_k - b) d log pi(psi_k) / d omega`` (their Algorithm 1).
+The policy is a Gaussian over psi with a learned mean omega and fixed standard deviations. For each setting drawn from
+it, one data set is rendered and one detector trained, whose score on the validation images is the setting's reward.
+After every ``samples`` settings, omega steps along ``mean_k (R_k - b) d log pi(psi_k) / d omega`` (their Algorithm 1).
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from neural_sim.ranges import Positive, PositiveInt, validated
 class LearningToSimulate:
     """A Gaussian policy over psi, whose mean steps along the policy gradient times the policy's variance.
 
-    Rewards are divided by their running standard deviation, so that steps depend neither on their unit nor on an
-    offset.
+    Advantages R - b are divided by their running root mean square, so that steps depend neither on the unit of rewards
+    nor on an offset.
 
     Args:
         name: name in reports.
-        learning_rate: number of deviations that omega moves at a mean advantage of one.
-        deviation: the policy's deviation, in logits of bins.
-        light_deviation: the policy's deviation, in weights of lights.
-        samples: K, the number of settings between two steps.
-        rewarded: the reward of an object's part of psi: the ``whole`` data set's score, or with ``object`` that of its
-            own class.
-        baseline: b: a ``moving_average`` of earlier rewards (the first settings, which have none, use their own mean),
-            or the mean of the step's other settings (``leave_one_out``).
+        learning_rate: factor on steps, which are in standard deviations of the policy.
+        deviation: standard deviation of the policy, in logits of bins.
+        light_deviation: standard deviation of the policy, in weights of lights.
+        samples: K, the number of settings for each step.
+        rewarded: what rewards an object's psi: the score of the ``whole`` data set, or that of its own class
+            (``object``).
+        baseline: b: a ``moving_average`` of earlier rewards (the first step, which has none, uses the mean of its own
+            settings), or the mean of the step's other settings (``leave_one_out``).
         decay: decay of the moving averages of rewards and of squared advantages.
-        rounds: settings for each outer iteration of the budget; two take about as long as one hypergradient.
+        rounds: number of settings for each outer iteration in the budget; two take about as long as one hypergradient.
 
     Raises:
         ValueError: ``leave_one_out`` with a single setting.
@@ -64,7 +64,7 @@ class LearningToSimulate:
     def begin(
         self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
     ) -> Policy:
-        """Make a policy with the mean ``psi``."""
+        """Start a policy with the mean ``psi``."""
         return Policy(self, distribution, psi.detach().clone(), generator)
 
 
@@ -72,7 +72,7 @@ _LEARNED = ("omega", "noise", "rewards", "mean", "variance")
 
 
 class Policy(Search):
-    """See ``LearningToSimulate``."""
+    """A run of ``LearningToSimulate``."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class Policy(Search):
     def ask(self) -> Float[Tensor, "objects K"]:
         noise = torch.randn(self._omega.shape, generator=self._generator, dtype=torch.float64).to(self._omega)
         self._noise.append(noise)
-        # The density is that of the draw before its projection: the projected draw has none.
+        # The policy gradient uses the density of the unprojected draw, because a projected one has no density.
         return self._distribution.constrained(self._omega + self._deviation * noise)
 
     @override
@@ -122,13 +122,13 @@ class Policy(Search):
             return
         advantages, noise = self._advantages(torch.stack(self._rewards)), torch.stack(self._noise)
         self._noise, self._rewards = [], []
-        # d log pi / d omega is noise / deviation; it is multiplied by the variance, so that a step is in deviations.
+        # d log pi / d omega is noise / deviation. Multiplied by the variance, it gives steps in units of the deviation.
         score = (advantages[..., None] * noise).mean(0)
         step = self._settings.learning_rate * self._deviation * score
         self._omega = self._distribution.constrained(self._omega + self._centred(step))
 
     def _advantages(self, rewards: Float[Tensor, "samples objects"]) -> Float[Tensor, "samples objects"]:
-        """Compute ``R - b`` divided by the root of its moving mean square, then update b."""
+        """Compute ``R - b``, divided by its running root mean square, and update both averages."""
         mean, decay = rewards.mean(0), self._settings.decay
         before = mean if self._mean is None else self._mean
         above = rewards - before
@@ -140,6 +140,6 @@ class Policy(Search):
         return torch.where(self._variance > 0.0, above / self._variance.sqrt(), 0.0)
 
     def _centred(self, step: Float[Tensor, "objects K"]) -> Float[Tensor, "objects K"]:
-        """Subtract each factor's mean: p does not depend on it, and weights add up to 1."""
+        """Subtract each factor's mean: p does not depend on it, and the weights of lights keep their sum."""
         parts = self._distribution.split(step)
         return self._distribution.join({n: part - part.mean(-1, keepdim=True) for n, part in parts.items()})

@@ -93,7 +93,7 @@ def test_the_object_that_differs_moves_to_what_its_boxes_show_and_the_other_stay
 
 def test_the_sentence_says_the_bin_with_its_interval(found):
     lamp = found.factors[0]
-    assert f"the lamp from pose bin 1 ({lamp.low[0]:.2f} to {lamp.high[0]:.2f})" in lamp.sentence
+    assert f"the lamp in pose bin 1 ({lamp.low[0]:.2f} to {lamp.high[0]:.2f})" in lamp.sentence
     assert "psi stays" in found.factors[1].sentence
 
 
@@ -108,7 +108,7 @@ def test_boxes_that_look_like_no_render_move_nothing(posed):
     result = read(scene, strange, psi)
     assert {one.finding for one in result.factors} == {"fits no render"}
     torch.testing.assert_close(result.psi, psi.double())
-    assert "look like no renders" in result.factors[0].sentence
+    assert "do not look like its renders" in result.factors[0].sentence
 
 
 def test_boxes_of_other_colours_move_nothing_though_the_classifier_is_sure_of_them(posed):
@@ -139,7 +139,7 @@ def test_renders_that_are_not_told_apart_move_nothing(posed):
     )
     same = read(replace(scene, subjects=alike), target_of(replace(scene, subjects=alike), P), psi)
     assert [one.finding for one in same.factors] == ["not told apart"] * 2
-    assert "renders do not tell its pose" in same.factors[0].sentence
+    assert "its pose cannot be told from renders" in same.factors[0].sentence
 
 
 def test_an_estimate_that_may_be_far_off_moves_nothing(posed, found):

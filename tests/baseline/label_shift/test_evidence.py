@@ -34,17 +34,17 @@ def test_doubt_is_the_mean_total_variation_of_the_draws():
 
 
 def test_a_sentence_names_groups_with_the_interval_of_their_sum():
-    assert MOVES.sentence == "your target shows the mug from pose bins 1/3 (0.80 to 1.00)"
+    assert MOVES.sentence == "your target shows the mug in pose bins 1/3 (0.80 to 1.00)"
 
 
 @pytest.mark.parametrize(
     "finding, said",
     [
-        ("stays", "psi stays, it may be right"),
+        ("stays", "psi stays, because it may be right already (p = 0.005)"),
         ("uncertain", "may be off by 0.40 in total variation), so psi stays"),
-        ("too few boxes", "40 boxes are too few"),
-        ("fits no render", "look like no renders of it (less than held-out ones do in 5% of all pairs"),
-        ("not told apart", "90% of held-out ones are read right, 0% by chance, so psi stays"),
+        ("too few boxes", "40 boxes are too few to estimate its pose"),
+        ("fits no render", "do not look like its renders (a box is stranger than a held-out render in 5%"),
+        ("not told apart", "from renders (90% of held-out ones are recognised, 0% by chance), so psi stays"),
     ],
 )
 def test_a_sentence_says_why_psi_does_not_move(finding, said):

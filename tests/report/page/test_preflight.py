@@ -78,8 +78,8 @@ def test_what_the_target_shows_is_said_and_drawn(tmp_path):
         ),
     )  # fmt: skip
     report = dataclasses.replace(preflight(0.001), shown=shown)
-    said = "your target shows the object 0 from pose bin 1 (0.81 to 0.97)"
-    assert said in report.summary() and "boxes look like no renders" in report.summary()
+    said = "your target shows the object 0 in pose bin 1 (0.81 to 0.97)"
+    assert said in report.summary() and "boxes do not look like its renders" in report.summary()
     images = LabelledImages(
         torch.rand(2, 3, 24, 24), torch.zeros(2, 1, 4), torch.full((2, 1), -1), torch.zeros(2).long()
     )

@@ -1,9 +1,9 @@
-"""Two guesses of a crop's bins, one by the network and one by its box alone, and their calibrated posterior.
+"""Two guesses of a crop's bins, by the network and by the size of the box alone, and their calibrated posterior.
 
-A network trained on few renders memorises them: of four bins of distance, it recognised half of other renders, where
-the size of the box alone recognises nine of ten. A quadratic logistic regression therefore reads the box, and held-out
-renders determine how much to trust each guess (Wolpert 1992): posteriors are the softmax of a_1 z_1 + a_2 z_2 + b with
-weights a >= 0 for the logits z of each guess, and a bias b for each combination of bins.
+A network trained on few renders memorises them: with four bins of distance, it recognised half of the held-out renders,
+while the size of the box alone recognises nine in ten. A quadratic logistic regression therefore reads the box, and
+held-out renders determine how much to trust each guess (Wolpert 1992): posteriors are the softmax of
+a_1 z_1 + a_2 z_2 + b, with weights a >= 0 for the logits z of each guess and a bias b for each combination of bins.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from neural_sim.baseline.label_shift.mixture import Cells
 
 @dataclass(frozen=True)
 class BoxReader:
-    """Logistic regressions of every factor's bins on the numbers of one object's boxes and their products.
+    """Logistic regressions of each factor's bins on the numbers that describe one object's boxes, and their products.
 
     Attributes:
-        low: smallest box numbers in the fit; smaller ones are raised to these, because squares do not extrapolate.
-        high: largest box numbers in the fit, likewise.
+        low: smallest value of each number in the fit; smaller values are raised to it, because squares extrapolate
+            badly.
+        high: largest value of each number in the fit; larger values are lowered to it.
         centre: means of the numbers.
-        spread: their standard deviations, 1 for numbers that do not vary.
-        weights: for every factor, of a constant, the numbers and their products.
+        spread: their standard deviations; 1 for numbers that do not vary.
+        weights: the coefficients of each factor: of a constant, the numbers and their products.
         cells: the combinations of bins.
     """
 
@@ -43,7 +44,10 @@ class BoxReader:
     def fitted(
         numbers: Float[Tensor, "n d"], known: Int[Tensor, "n"], cells: Cells, ridge: float = 1.0
     ) -> BoxReader:
-        """Fit to boxes of renders in ``known`` cells; ``ridge``: half the penalty on squares of all but constants."""
+        """Fit to boxes of renders in ``known`` cells, with a penalty of ``ridge`` / 2 times the squared weights.
+
+        The weights of constants are not penalised.
+        """
         numbers = numbers.double()
         centre, spread = numbers.mean(0), numbers.std(0)
         spread = torch.where(spread > 1e-6, spread, torch.ones_like(spread))
@@ -83,7 +87,7 @@ def _regressed(
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated logits, a weighted sum of the guesses plus a bias, for each sample of the renders that gave them."""
+    """Weights of the guesses' logits, and biases, fitted to each of several samples of the held-out renders."""
 
     weights: Float[Tensor, "samples guesses 1 1"]
     bias: Float[Tensor, "samples 1 cells"]
@@ -104,8 +108,8 @@ def calibrate(
     Args:
         guesses: logits of held-out renders of one object.
         cells: the renders' true cells.
-        samples: number of times that each render is in each of several samples; None: one sample of all.
-        ridge: penalty on the biases' squares, in renders; keeps biases from few renders near 0.
+        samples: for each of several samples, how often it contains each render; None: one sample, with each once.
+        ridge: factor of the penalty on squared biases, which keeps biases that rest on few renders near 0.
     """
     counts = guesses.new_ones(1, len(cells)) if samples is None else samples.to(guesses)
     shape = (len(counts), len(guesses), 1, 1)
@@ -122,7 +126,7 @@ def calibrate(
 
 
 def _minimised(variables: Sequence[Tensor], loss: Callable[[], Tensor]) -> list[Tensor]:
-    """Minimise a smooth loss in place."""
+    """Minimise a smooth loss, changing the variables in place; return their final values."""
     optimiser = torch.optim.LBFGS(list(variables), max_iter=100, line_search_fn="strong_wolfe")
 
     def closure() -> Tensor:

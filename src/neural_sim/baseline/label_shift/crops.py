@@ -1,4 +1,4 @@
-"""Crops around labelled boxes, with the boxes' own numbers, and augmentations for what renders lack."""
+"""Crops around labelled boxes, numbers that describe the boxes, and augmentations for variation that renders lack."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from neural_sim.ranges import Fraction, NonNegative, validated
 from neural_sim.types import LabelledImages
 
 SIDE = 32
-"""Side in pixels of the network's input."""
+"""Side of the network's input, in pixels."""
 MARGIN = 1.5
-"""Side of a stored crop in sides of the box, so that rotations and shifts still find pixels."""
+"""Side of a stored crop, in multiples of the box's longer side: large enough that rotated and shifted views have
+pixels."""
 _STORED = 44
-_SHOWN = 1.1  # side of the network's input, in sides of the box
+_SHOWN = 1.1  # side of the network's view, in multiples of the box's longer side
 BOX_NUMBERS = 5
-"""Number of values that describe a box."""
+"""How many numbers describe a box."""
 SIZE = (0, 1, 4)
-"""Those values that describe its size: width, height and whether the border may cut it off."""
+"""The indices of those that describe its size: width, height and whether the border may cut it off."""
 
 
 @dataclass(frozen=True)
 class Crops:
-    """Square crops about boxes.
+    """Square crops around boxes.
 
     Attributes:
-        pixels: pixels in [0, 1] of ``MARGIN`` sides of the box; outside the image they have its mean colour.
-        boxes: logarithms of width and height as fractions of the image's, the centre from -1 to 1, and whether the box
-            touches the border.
+        pixels: pixels in [0, 1]; outside the image, they have its mean colour.
+        boxes: logarithms of width and height as fractions of the image's, the centre from -1 to 1, and 1 if the box
+            touches the border, else 0.
         labels: class of each crop.
-        rows: row of its image in the set.
+        rows: row of each crop's image in the set.
     """
 
     pixels: Float[Tensor, "n 3 side side"]
@@ -60,7 +61,7 @@ class Crops:
 
 
 def crops_of(images: LabelledImages, whole: bool) -> Crops:
-    """Cut out all labelled boxes, image by image; with ``whole``, the whole images, whose boxes mean nothing."""
+    """Cut out all labelled boxes, image by image; with ``whole``, the whole image in place of each box."""
     rows, columns = images.present.nonzero().unbind(1)
     height, width = images.images.shape[-2:]
     edges = images.boxes.new_tensor([width, height, width, height])
@@ -71,7 +72,7 @@ def crops_of(images: LabelledImages, whole: bool) -> Crops:
     centre = 0.5 * (boxes[:, :2] + boxes[:, 2:])
     half = 0.5 * MARGIN * size.amax(1, keepdim=True)
     regions = torch.cat([rows[:, None].to(boxes), centre - half, centre + half], 1)
-    # The image is surrounded by its mean colour, so the crop is of the image minus the mean, which is then added.
+    # roi_align pads with 0: subtracting the mean colour before it, and adding it again, pads with the mean colour.
     mean = images.images.mean((2, 3), keepdim=True)
     ratio = max(1, round(float(2.0 * half.median()) / _STORED)) if len(rows) else 1
     pixels = (
@@ -90,13 +91,14 @@ class Augmentation:
     """Random changes of crops, so that renders cover the variation of photographs.
 
     Args:
-        roll_deg: largest rotation in the image plane either way, in degrees; 180 for cameras held at any roll.
-        exposure: largest change of brightness either way, in stops; contrast and colour change with it. Not used if psi
-            weighs lights.
+        roll_deg: largest rotation in the image plane, in either direction, in degrees; 180 for cameras held at any
+            roll.
+        exposure: largest change of brightness, in either direction, in stops; contrast and colour change with it. Not
+            used if psi has lights.
         blur: largest fraction of a crop's detail that is lost.
         noise: largest standard deviation of pixel noise.
         occlusion: fraction of the crops in which a rectangle is hidden.
-        jitter: largest error of a box's sides, as a fraction of the sides.
+        jitter: scale of the random errors of a box's size and place, as a fraction of its sides.
     """
 
     roll_deg: Annotated[float, Ge(0), Le(180)] = 10.0
@@ -107,7 +109,7 @@ class Augmentation:
     jitter: Annotated[float, Ge(0), Le(0.5)] = 0.08
 
     def __call__(self, crops: Crops, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return the network's view of the crops, and the numbers of their boxes."""
+        """Return the network's view of the crops and the numbers of their boxes, both changed at random."""
         n, like = len(crops), crops.pixels
 
         def either(*shape: int) -> Tensor:
@@ -134,9 +136,8 @@ class Augmentation:
         across = (at - SIDE * u[0]).abs() < SIDE * (0.08 + 0.17 * u[1])
         down = (at - SIDE * u[2]).abs() < SIDE * (0.08 + 0.17 * u[3])
         covers = (across[:, None, :] & down[:, :, None] & (u[4] < self.occlusion)[..., None])[:, None]
-        other = seen[torch.randperm(n, generator=generator)].flip(
-            3
-        )  # from another crop: a texture, not a plain colour
+        # The rectangle shows part of another crop: a texture, not a plain colour.
+        other = seen[torch.randperm(n, generator=generator)].flip(3)
         return torch.where(covers.to(seen.device), other, seen)
 
 
@@ -153,7 +154,7 @@ def quarters(crops: Crops) -> Float[Tensor, "n 12"]:
 
 
 def _softened(pixels: Float[Tensor, "n 3 side side"]) -> Float[Tensor, "n 3 side side"]:
-    """Blur by the weights 1, 2, 3, 2, 1 along both sides."""
+    """Blur with the weights 1, 2, 3, 2, 1 along both axes."""
     for axis in (2, 3):
         for _ in range(2):
             ahead, behind = (pixels.roll(step, axis) for step in (1, -1))
@@ -162,7 +163,7 @@ def _softened(pixels: Float[Tensor, "n 3 side side"]) -> Float[Tensor, "n 3 side
 
 
 def _sampled(pixels: Tensor, roll: Tensor, zoom: Tensor, shift: Tensor) -> Float[Tensor, "n 3 side side"]:
-    """Sample the middle of stored crops, rotated, scaled and shifted (in sides of the box)."""
+    """Sample the middle of stored crops, rotated, scaled, and shifted by multiples of the box's longer side."""
     if not len(pixels):
         return pixels.new_zeros(0, 3, SIDE, SIDE)
     scale = _SHOWN / MARGIN * zoom

@@ -1,12 +1,13 @@
-"""psi estimated from a target's labelled boxes by label shift, in seconds and without a detector.
+"""Estimate psi from a target's labelled boxes by label shift, in seconds and without a detector.
 
     estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
 
 Renders of all bins, from a pool that is rendered once, train a small classifier of bins (``network``) and another that
-uses only the size of boxes (``calibration``); both read the target's boxes. Expectation maximisation over their
-calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each bin,
-a test against the present psi, and a test of fit (``evidence``). ``Estimate.psi`` moves only where both tests
-allow it.
+uses only the size of boxes (``calibration``). Both classify the target's boxes. Expectation maximisation over their
+calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each bin;
+weights of lights come from matching moments (``moments``). A factor of ``Estimate.psi`` moves only if the target
+differs significantly from the present psi, and if there are enough boxes, they look like renders (``evidence``), the
+classifier recognises renders, and the estimate is precise enough.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
 
 Groups = Mapping[str, Mapping[str, Sequence[Sequence[int]]]]
-"""Bins, numbered from 1, that an object's symmetry makes equal, by object and factor."""
+"""Groups of bins, numbered from 1, that look the same because an object is symmetric, by object and factor."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,11 @@ class Estimate:
     """The distributions that the target's boxes show.
 
     Attributes:
-        factors: each factor of psi, object by object.
-        psi: the present psi, with those factors replaced that move.
-        images: number of images that were rendered or composed.
+        factors: the estimates of all factors, object by object.
+        psi: the present psi, with the factors that move replaced.
+        images: number of crops of renders, for training and held out.
         seconds: duration.
-        cpu_seconds: processor seconds by purpose: pool, images, network, evidence.
+        cpu_seconds: processor seconds by phase: pool, images, network, evidence.
     """
 
     factors: tuple[FactorEstimate, ...]
@@ -53,7 +54,7 @@ class Estimate:
 
     @property
     def sentences(self) -> list[str]:
-        """A sentence for each object and factor, for the console and the pages."""
+        """One sentence for each object and factor, for the console and the pages."""
         return [one.sentence for one in self.factors]
 
 
@@ -79,8 +80,7 @@ def estimate(
     """Estimate psi from the boxes of ``validation``.
 
     Args:
-        scene: a scene of pooled renders (``pool_of``), or of fields, from which a pool is then rendered
-            here.
+        scene: a scene of pooled renders (``pool_of``), or one of subjects from which a pool can be rendered.
         validation: labelled images of the target.
         psi: the present psi.
         settings: settings of the estimate.
@@ -98,9 +98,7 @@ def estimate(
     cells = Cells(tuple(f.bins for f in distribution.binned))
     network = BinNetwork.drawn(len(scene.names), cells.count, distribution.lights, generator)
     augmentation = settings.augmentation
-    if (
-        distribution.lights
-    ):  # lights are the difference to be measured, and changes of exposure must not hide it
+    if distribution.lights:  # random exposures would hide the light, which is to be estimated
         augmentation = replace(augmentation, exposure=0.0)
     settings.fitting(training, network, augmentation, generator)
     clock("network")

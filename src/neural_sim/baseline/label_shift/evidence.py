@@ -1,4 +1,4 @@
-"""The estimate of one object's factor, with the evidence for it."""
+"""The estimate of one factor of an object's psi, and the evidence for it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Finding = Literal["moves", "stays", "uncertain", "not told apart", "fits no rend
 
 @dataclass(frozen=True)
 class Span:
-    """Probabilities ``p`` with the ends of their intervals, and the target's expected distance from ``p``."""
+    """Probabilities ``p`` with intervals, and the expected total variation between ``p`` and the target (``doubt``)."""
 
     p: tuple[float, ...]
     low: tuple[float, ...]
@@ -26,7 +26,7 @@ class Span:
 
     @staticmethod
     def of(p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], covered: float) -> Span:
-        """Return intervals that cover the fraction ``covered`` of the draws."""
+        """Take intervals that cover the central fraction ``covered`` of the draws from the posterior of p."""
         tail = 0.5 * (1.0 - covered)
         low, high = (tuple(drawn.quantile(part, 0).tolist()) for part in (tail, 1.0 - tail))
         doubt = total_variation(drawn, p.expand_as(drawn)).mean()
@@ -35,28 +35,28 @@ class Span:
 
 @dataclass(frozen=True)
 class FactorEstimate:
-    """One object's distribution of a factor as the target's boxes show it.
+    """What the target's boxes show of one factor of an object's psi.
 
     Attributes:
         name: the object.
         factor: the factor of psi.
         boxes: number of boxes that were read.
         start: probabilities of the bins, or weights of the lights, at the present psi.
-        p: most probable probabilities of the bins, or weights of the lights.
+        p: estimated probabilities of the bins, or weights of the lights.
         low: lower ends of their intervals.
         high: upper ends of their intervals.
         groups: bins (from 1) that look the same; psi decides how a group's probability is divided among them.
         p_value: p-value of the null hypothesis that the target is at the present psi.
-        strange: probability that a box looks less like the renders than a held-out render does; 0.5 if they look
-            alike.
+        strange: probability that a box looks less like the renders than a held-out render does; 0.5 if boxes look like
+            renders.
         accuracy: fraction of held-out renders whose group of bins is recognised; for lights, the fraction of the
             guesses' variance that weights explain.
-        finding: whether psi ``moves`` to the estimate; ``stays``, because the target may be at the present psi; or does
-            not move because the estimate is uncertain, renders themselves cannot be told apart, boxes look like no
-            render, or there are too few.
+        finding: whether psi moves. It ``moves`` to the estimate, or ``stays`` because the target may be at the present
+            psi. Otherwise it does not move because the estimate is ``uncertain``, renders are ``not told apart``, the
+            target ``fits no render``, or there are ``too few boxes``.
         chance: accuracy of guessing without looking.
         doubt: expected total variation between the estimate and the target's distribution.
-        converged: whether the search for the mixture converged; it does not if the likelihood is flat.
+        converged: whether the search for the mixture converged, which it does not if the likelihood is flat.
     """
 
     name: str
@@ -77,22 +77,22 @@ class FactorEstimate:
 
     @property
     def sentence(self) -> str:
-        """A sentence that says what the target shows, for the console and the pages."""
+        """What the target shows, as a sentence for the console and the pages."""
         if self.finding == "too few boxes":
-            return f"{self.name}: {self.boxes} boxes are too few to read its {self.factor} off"
+            return f"{self.name}: {self.boxes} boxes are too few to estimate its {self.factor}"
         if self.finding == "fits no render":
             return (
-                f"{self.name}: its boxes look like no renders of it (less than held-out ones do in {self.strange:.0%} "
-                f"of all pairs, 50 % where alike), so its {self.factor} is not read off them"
+                f"{self.name}: its boxes do not look like its renders (a box is stranger than a held-out render in "
+                f"{self.strange:.0%} of pairs, 50% if they look alike), so its {self.factor} is not estimated"
             )
         if self.finding == "not told apart":
-            why = f"{self.accuracy:.0%} of held-out ones are read right, {self.chance:.0%} by chance"
+            why = f"{self.accuracy:.0%} of held-out ones are recognised, {self.chance:.0%} by chance"
             if not self.converged:
-                why = f"the likelihood is flat ({why})"
-            return f"{self.name}: renders do not tell its {self.factor}: {why}, so psi stays"
+                why = f"the likelihood is flat; {why}"
+            return f"{self.name}: its {self.factor} cannot be told from renders ({why}), so psi stays"
         if self.finding == "uncertain":
             return (
-                f"{self.name}: its boxes leave open which {self.factor} they show (the estimate may be off by "
+                f"{self.name}: its boxes do not determine its {self.factor} (the estimate may be off by "
                 f"{self.doubt:.2f} in total variation), so psi stays"
             )
         shown = ", ".join(
@@ -100,15 +100,15 @@ class FactorEstimate:
             for group in self._largest
         )
         ending = (
-            f"; psi stays, it may be right already (p = {self.p_value:.2g})"
+            f"; psi stays, because it may be right already (p = {self.p_value:.2g})"
             if self.finding == "stays"
             else ""
         )
-        return f"your target shows the {self.name} from {self.factor} {shown}{ending}"
+        return f"your target shows the {self.name} in {self.factor} {shown}{ending}"
 
     @property
     def _largest(self) -> list[tuple[int, ...]]:
-        """The largest groups, at most three."""
+        """The most probable groups, until they make up three quarters; at most three."""
         ordered = sorted(self.groups, key=lambda group: -_sum(self.p, group))
         shown, total = [], 0.0
         for group in ordered[:3]:
@@ -146,12 +146,12 @@ def _called(group: Sequence[int]) -> str:
 class Strangeness:
     """Distance of features from those of renders: the Mahalanobis distance to the nearest cell (Lee et al. 2018).
 
-    The part of the features that the light explains does not count as distance: it is removed first, linearly.
+    The linear effect of the light on the features is removed first.
 
     Attributes:
         means: mean features of every cell's renders.
         precision: inverse of the covariance that all cells share.
-        light: change of the features with the weights of the lights.
+        light: linear coefficients of the features on the weights of the lights.
     """
 
     means: Float[Tensor, "cells d"]
@@ -165,7 +165,7 @@ class Strangeness:
         weights: Float[Tensor, "n lights"],
         shrinkage: float = 0.1,
     ) -> Strangeness:
-        """Fit means and covariance; ``shrinkage`` draws the latter towards a multiple of the identity."""
+        """Fit means and covariance; ``shrinkage`` pulls the covariance towards a multiple of the identity."""
         eye = torch.eye(weights.shape[1], dtype=features.dtype)
         light = torch.linalg.solve(weights.T @ weights + 1e-6 * eye, weights.T @ features)
         features = features - weights @ light

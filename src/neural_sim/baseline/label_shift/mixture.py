@@ -6,8 +6,8 @@ maximum-likelihood p is the fixed point of (Saerens, Latinne and Decaestecker 20
 
     p_c <- mean_n r_n(c),    r_n(c) = p_c q(c | x_n) / sum_d p_d q(d | x_n).
 
-Here p is a product of the factors' distributions, so that each factor's is the margin of the r_n, and a Dirichlet prior
-adds ``prior`` boxes to every bin.
+Here p is a product of the factors' distributions, so each factor's p_c is updated with the marginals of the r_n, and a
+Dirichlet prior adds ``prior`` boxes to every bin.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Mixed:
 
     Attributes:
         p: probabilities of every factor's bins.
-        log_likelihood: log-likelihood of the boxes, up to the classifier's constant.
+        log_likelihood: log-likelihood of the boxes, up to a constant.
         status: how the search ended.
         steps: number of steps taken.
     """
@@ -51,7 +51,7 @@ class Mixed:
 
 @dataclass(frozen=True)
 class Cells:
-    """The combinations of ``sizes`` bins of the factors, the last factor's bins changing fastest."""
+    """The combinations of the factors' bins (``sizes``: how many each factor has); the last factor changes fastest."""
 
     sizes: tuple[int, ...]
 
@@ -68,7 +68,7 @@ class Cells:
         return whole
 
     def margins(self, counts: Float[Tensor, "*batch cells"]) -> Probabilities:
-        """Sum up the counts in every bin of each factor."""
+        """Sum the counts in every bin of each factor."""
         table = counts.unflatten(-1, self.sizes)
         first = counts.ndim - 1
         axes = range(first, first + len(self.sizes))
@@ -77,11 +77,11 @@ class Cells:
         )
 
     def bins(self, index: Int[Tensor, "n"]) -> tuple[Int[Tensor, "n"], ...]:
-        """Return every factor's bins in given combinations."""
+        """Return the bins of every factor in the given combinations."""
         return tuple(torch.unravel_index(index, self.sizes))
 
     def index(self, bins: Int[Tensor, "n factors"]) -> Int[Tensor, "n"]:
-        """Return the combinations of given bins."""
+        """Return the indices of combinations of the given bins."""
         index = torch.zeros(len(bins), dtype=torch.long)
         for own, size in zip(bins.unbind(1), self.sizes, strict=True):
             index = index * size + own
@@ -96,7 +96,7 @@ def grouped(
     Args:
         likelihood: likelihood of each box in every cell.
         cells: the combinations of bins.
-        within: for every factor, column g is the distribution over the bins of group g.
+        within: for each factor, a matrix whose column g is the distribution over the bins of group g.
 
     Returns:
         The likelihood in every combination of groups.
@@ -115,7 +115,7 @@ def maximise(
     steps: int = 1000,
     tolerance: float = 1e-7,
 ) -> Mixed:
-    """Find the most probable mixture by expectation maximisation from equal probabilities.
+    """Find the most probable mixture by expectation maximisation, starting from equal probabilities.
 
     Args:
         likelihood: likelihood of each box in every cell, up to a factor for each box; not negative, and positive
@@ -124,7 +124,7 @@ def maximise(
         prior: number of boxes that the Dirichlet prior adds to every bin.
         fixed: given distributions, by the position of their factor.
         steps: largest number of steps.
-        tolerance: largest change of a probability in the last step.
+        tolerance: largest change of a probability at which the search stops.
     """
     like = likelihood.double()
     batch, fixed = like.shape[:-2], fixed or {}
@@ -172,11 +172,11 @@ def posterior(
     burn: int = 40,
     kept: int = 10,
 ) -> Probabilities:
-    """Draw mixtures from their posterior by Gibbs sampling: cells of the boxes given p, then p given their numbers.
+    """Draw mixtures from their posterior by Gibbs sampling: the boxes' cells given p, then p given the cells.
 
-    The Dirichlet prior has the parameter ``prior``: given the boxes' cells, the mean of p is what ``maximise`` makes of
-    them. (With 1 more, its mode would be that, and a bin with nearly all boxes would be drawn too rarely.) If the
-    likelihood is uncertain, its ``samples`` share the chains.
+    The Dirichlet prior has the parameter ``prior``, so that, given the boxes' cells, the mean of p is the update of
+    ``maximise``. (With ``prior`` + 1, that would be the mode, and a bin with nearly all boxes would get too little
+    probability.) If the likelihood itself was estimated, ``samples`` of it divide the chains among them.
 
     Returns:
         ``chains`` x ``kept`` draws of every factor's probabilities, [draws, k].
@@ -213,9 +213,9 @@ def ratio_test(
 ) -> float:
     """Compute the p-value of the null hypothesis that some factors have given distributions, by parametric bootstrap.
 
-    The statistic is twice the logarithm of the likelihood ratio. Under the null hypothesis it is that of equally many
-    of the ``known`` boxes, with cells drawn from the null (for other factors, from the best fit under it): the
-    classifier's errors are then the same as for the target's boxes.
+    The statistic is twice the logarithm of the likelihood ratio. Its null distribution comes from samples of as many
+    ``known`` boxes, with cells drawn from the null (for other factors, from the best fit under it): the classifier errs
+    on them as on the target's boxes.
 
     Args:
         likelihood: likelihood of each box in every cell.

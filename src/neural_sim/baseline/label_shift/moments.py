@@ -1,14 +1,15 @@
-"""Weights of lights from a sample's mean by matching moments, because lights do not mix images (pure functions).
+"""Estimate the weights of lights by matching moments (pure functions).
 
-All images of an object share one light. Guesses y of the weights w are shrunk towards the most common renders, and so
-are not estimates themselves; but over held-out renders of known weights their mean is nearly linear, E[y | w] = B w.
-The weights are those at which it equals the target's mean (indirect inference, Gourieroux, Monfort and Renault 1993):
+All images of an object share one light, so they are no mixture. Guesses y of the weights w are biased towards the
+weights of common renders, and so are not estimates themselves; but over held-out renders of known weights, their mean
+is nearly linear: E[y | w] = B w. The estimate is the w at which this mean is nearest to the mean guess of the target's
+boxes, ybar (indirect inference, Gourieroux, Monfort and Renault 1993):
 
     w = argmin (ybar - B w)^T S^-1 (ybar - B w),    S = cov(ybar).
 
-There are two guesses of each weight: the network's, and one that is linear in the colours of a crop's quarters, as
-light itself is additive. S says which to trust: the colours, if few renders trained the network. Covariances between
-the two are left out: otherwise the systematic errors of one would correct the other.
+There are two guesses of each weight: the network's, and one that is linear in the colours of a crop's quarters, because
+light is additive. S says which to trust: the colours, if few renders trained the network. Covariances between the two
+are set to 0: otherwise the systematic errors of one would be used to correct the other.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ Project = Callable[[Float[Tensor, "*n k"]], Float[Tensor, "*n k"]]
 class Response:
     """How guesses depend on weights.
 
-    slope: B.
-    scatter: covariance of a guess around B w.
-    precision: inverse of the sum of w w^T over the different renders from which B was fitted.
-    explained: fraction of the guesses' variance that B w explains.
+    Attributes:
+        slope: B.
+        scatter: covariance of a guess around B w.
+        precision: inverse of the sum of w w^T over the different renders from which B was fitted.
+        explained: fraction of the guesses' variance that B w explains.
     """
 
     slope: Float[Tensor, "m k"]
@@ -48,8 +50,10 @@ class Response:
         lights = weights.shape[1]
         own = torch.arange(guesses.shape[1]) // lights
         scatter = left.T @ left / max(len(left) - lights, 1) * (own[:, None] == own)
-        least = (0.03 * scatter.diagonal()).clamp_min(1e-12).diag()  # weights sum to 1, and guesses nearly do
-        several = len(weights) / len(weights.unique(dim=0))  # images of one render, whose errors are alike
+        # Weights sum to 1 and guesses nearly do, so that their scatter alone is nearly singular.
+        least = (0.03 * scatter.diagonal()).clamp_min(1e-12).diag()
+        # Images of one render have similar errors, and count once.
+        several = len(weights) / len(weights.unique(dim=0))
         variance = float((guesses - guesses.mean(0)).square().sum())
         explained = 1.0 - float(left.square().sum()) / max(variance, 1e-12)
         return Response(slope, scatter + least, several * precision, explained)
@@ -57,14 +61,14 @@ class Response:
     def covariance(self, boxes: int, weights: Float[Tensor, "k"]) -> Float[Tensor, "m m"]:
         """Compute the covariance of the mean of ``boxes`` guesses minus B w, including the error of B.
 
-        The boxes share one light. The linear model's error for that light is the same in all of them and does not
-        average out. Renders cannot separate it from differences between boxes, so all of the scatter is assumed to be
-        of that kind.
+        The boxes share one light. The linear model's error at that light is the same for all of them and does not
+        average out. The scatter of renders does not separate it from differences between boxes, so all of the scatter
+        counts as both.
         """
         return self.scatter * (1.0 + 1.0 / boxes + weights @ self.precision @ weights)
 
     def misfits(self, guesses: Float[Tensor, "n m"], project: Project) -> Float[Tensor, "n"]:
-        """Compute the distance of each guess from those of any weights, as in Hansen's test of overidentification."""
+        """Compute each guess's distance from the nearest B w, as in Hansen's test of overidentification."""
         nearest = matched(guesses, self.slope, self.scatter, project)
         return distance(guesses, nearest, self.slope, self.scatter)
 
@@ -75,7 +79,7 @@ def fitted(
     others: Float[Tensor, "m d"],
     ridge: float = 1e-3,
 ) -> Float[Tensor, "m k"]:
-    """Guess weights linearly from inputs, fitted to renders of known weights (ridge regression)."""
+    """Guess the weights of ``others`` by ridge regression on the ``inputs`` of renders of known weights."""
     centre, middle = inputs.mean(0), weights.mean(0)
     apart = inputs - centre
     eye = ridge * len(inputs) * apart.square().mean().clamp_min(1e-12) * torch.eye(inputs.shape[1]).to(inputs)
@@ -90,7 +94,7 @@ def matched(
     project: Project,
     steps: int = 2000,
 ) -> Float[Tensor, "*n k"]:
-    """Find the weights whose mean guess is nearest, by accelerated projected gradients (Beck and Teboulle 2009)."""
+    """Find the w whose B w is nearest to ``mean``, by accelerated projected gradients (Beck and Teboulle 2009)."""
     inverse = torch.linalg.inv(covariance)
     inverse = inverse / inverse.diagonal().mean()
     quadratic = slope.T @ inverse @ slope
@@ -123,6 +127,6 @@ def distance(
 def scattered(
     mean: Float[Tensor, "m"], covariance: Float[Tensor, "m m"], draws: int, generator: torch.Generator
 ) -> Float[Tensor, "draws m"]:
-    """Draw means from the normal distribution around ``mean``."""
+    """Draw from the normal distribution with this mean and covariance."""
     noise = torch.randn(draws, len(mean), generator=generator, dtype=mean.dtype)
     return mean + noise @ torch.linalg.cholesky(covariance).T

@@ -24,8 +24,8 @@ class Known:
 
     Attributes:
         crops: the crops.
-        cells: each one's combination of bins.
-        weights: each one's weights of the lights; no columns if the light is fixed.
+        cells: combination of bins of each crop.
+        weights: weights of the lights in each crop; no columns if the light is fixed.
     """
 
     crops: Crops
@@ -46,7 +46,7 @@ class PerObject(nn.Module):
         self.bias = nn.Parameter(torch.zeros(objects, outputs))
 
     def forward(self, values: Float[Tensor, "n i"], labels: Int[Tensor, "n"]) -> Float[Tensor, "n o"]:
-        """Apply to each crop the layer of its object."""
+        """Apply each object's layer to its crops."""
         return torch.einsum("noi,ni->no", self.weight[labels], values) + self.bias[labels]
 
 
@@ -90,7 +90,7 @@ class BinNetwork(nn.Module):
         labels: Int[Tensor, "n"],
     ) -> tuple[Float[Tensor, "n cells"], Float[Tensor, "n lights"], Float[Tensor, "n features"]]:
         """Return logits of the cells, weights of the lights, and the features from which both are computed."""
-        if not self.lights:  # exposures that differ from the renders' must not change the bins
+        if not self.lights:  # the exposure of photographs differs from that of renders and must not matter
             apart = seen - seen.mean((1, 2, 3), keepdim=True)
             seen = apart / (apart.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.01)
         image = self.joined(self.convolutions(seen).flatten(1))
@@ -107,8 +107,8 @@ class Fitting:
 
     Args:
         epochs: number of passes over all crops.
-        batch_size: number of crops in a step.
-        learning_rate: peak learning rate of Adam, in one cycle.
+        batch_size: largest number of crops in a step.
+        learning_rate: peak learning rate of AdamW, in one cycle.
         weight_decay: decoupled weight decay.
     """
 
@@ -148,7 +148,7 @@ class Fitting:
 
 @dataclass(frozen=True)
 class Outputs:
-    """A network's outputs on crops: logits of the cells, guesses of the lights' weights, features behind both.
+    """A network's outputs on crops: logits of the cells, guesses of the weights of the lights, and features.
 
     Guesses from other sources may be added to these.
     """

@@ -1,4 +1,4 @@
-"""Reads the target's boxes object by object with a trained classifier of bins."""
+"""Estimate psi from the target's boxes, object by object, with a trained classifier of bins."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from neural_sim.parameter.product import SceneDistribution
 Bins = Sequence[Sequence[int]]
 """Groups of bins, numbered from 1, that look the same."""
 NEVER = -1e3
-"""The logit of a cell that is never drawn: finite, so that a temperature can be found."""
+"""Logit of a cell that is never drawn; finite, because calibration multiplies it by a weight."""
 BEYOND_ALL = 0.995
-"""Largest strangeness if only lights move: boxes share one light, so that they are strange together or not at all."""
+"""Limit of ``strange`` if psi has lights only: all boxes share one light, so either all of them are strange or none."""
 CALIBRATIONS = 20
-"""Number of samples of the held-out renders, whose calibrations differ as much as the calibration may err."""
+"""Number of bootstrap samples of the held-out renders; the scatter of their calibrations shows how far one may err."""
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A trained network, with its training set and what it should read.
+    """A trained network, with the crops that it was trained on, those held out, and those of the target.
 
     Attributes:
         settings: settings of the estimate.
         distribution: p_psi.
         network: the classifier.
         training: crops on which it was trained.
-        held: crops of other renders.
+        held: crops of held-out renders.
         target: crops of the target.
         generator: the source of all random numbers.
     """
@@ -55,7 +55,7 @@ class Reader:
     def read(
         self, label: int, name: str, psi: Float[Tensor, "K"], groups: Mapping[str, Bins]
     ) -> tuple[list[FactorEstimate], Float[Tensor, "K"]]:
-        """Return the estimates of an object's factors, and its psi with those factors replaced that move."""
+        """Return the estimates of an object's factors, and its psi with the factors that move replaced."""
         now = self.distribution.split(psi)
         drawn = _drawn(self.distribution, now)
         training, held = (
@@ -64,7 +64,7 @@ class Reader:
         )
         target = self.target.select(self.target.labels == label)
         seen, known = (self._guessed(training, crops, drawn) for crops in (target, held.crops))
-        limits = None  # no render shows the object
+        limits = None  # stays None if no render shows the object
         if len(training.crops) and len(held.crops):
             features = outputs_of(self.network, training.crops).features
             limits = Strangeness.of(features, training.cells, training.weights.double())
@@ -79,7 +79,7 @@ class Reader:
         return found, self.distribution.join(new)
 
     def _guessed(self, training: Known, crops: Crops, drawn: Bool[Tensor, "cells"]) -> Outputs:
-        """Return the network's outputs, and add logits from boxes alone and light weights from colours alone."""
+        """Return the network's outputs, with logits from boxes alone and weights of lights from colours alone added."""
         outputs = outputs_of(self.network, crops)
         logits, weights = [outputs.logits], [outputs.weights]
         if self.distribution.binned and len(training.crops):
@@ -95,7 +95,7 @@ class Reader:
 
 @dataclass(frozen=True)
 class _Read:
-    """A factor as it was read: ``p`` with intervals, by groups of bins, and the evidence for it."""
+    """The estimate of one factor with its intervals, the groups of bins that look the same, and the evidence."""
 
     span: Span
     groups: Bins
@@ -107,7 +107,10 @@ class _Read:
 
 @dataclass(frozen=True)
 class _Object:
-    """One object: ``psi`` by factor, the ``known`` held-out renders, and the target's boxes as ``seen``."""
+    """One object, with its ``psi`` by factor.
+
+    ``known`` are the outputs for its held-out renders (``held``), ``seen`` those for the target's boxes.
+    """
 
     reader: Reader
     name: str
@@ -136,7 +139,7 @@ class _Object:
     def _strange(
         self, limits: Strangeness, weights: Float[Tensor, "lights"], frequency: Float[Tensor, "held"]
     ) -> float:
-        """Compare the boxes with held-out renders: by features or, if only lights move, by what weights explain."""
+        """Compare the boxes with held-out renders by features or, if psi has lights only, by guesses of the weights."""
         lights = [f for f in self.reader.distribution.factors if f not in self.reader.distribution.binned]
         if len(lights) == len(self.reader.distribution.factors):
             response = Response.of(self.known.weights, self.held.weights.double())
@@ -168,10 +171,10 @@ class _Object:
         )  # fmt: skip
 
     def _binned(self) -> tuple[dict[str, _Read], Float[Tensor, "held"]]:
-        """Read all factors with bins together: boxes are a mixture of their combinations.
+        """Estimate all factors with bins together: boxes are a mixture of combinations of their bins.
 
         Returns:
-            The factors, and how often the boxes show the cell of each held-out render.
+            The estimates by factor, and a weight for each held-out render that makes cells as frequent as in the boxes.
         """
         settings, generator = self.reader.settings, self.reader.generator
         factors = self.reader.distribution.binned
@@ -219,7 +222,7 @@ class _Object:
         return grouped(posteriors.flatten(0, 1), every, within).unflatten(0, posteriors.shape[:2])
 
     def _light(self, factor: Factor) -> _Read:
-        """Estimate the weights of the lights by the mean of the network's guesses."""
+        """Estimate the weights of the lights from the mean of all boxes' guesses."""
         settings, generator = self.reader.settings, self.reader.generator
         response = Response.of(self.known.weights, self.held.weights.double())
         now, boxes = self.psi[factor.name].double(), len(self.seen)
@@ -244,7 +247,7 @@ class _Object:
 
 
 def _drawn(distribution: SceneDistribution, psi: Mapping[str, Tensor]) -> Bool[Tensor, "cells"]:
-    """Select the combinations of bins that are drawn at all, without those that no photograph of the object shows."""
+    """Select the combinations of bins that are drawn at all; bins that no photograph of the object shows are not."""
     parts = tuple((factor.p_of(psi[factor.name]) > 0.0).double() for factor in distribution.binned)
     if not parts:
         return torch.ones(1, dtype=torch.bool)
@@ -252,13 +255,13 @@ def _drawn(distribution: SceneDistribution, psi: Mapping[str, Tensor]) -> Bool[T
 
 
 def _drawn_groups(p: Float[Tensor, "k"], groups: Bins) -> Bins:
-    """Leave out bins with probability 0: no photograph shows the side in their renders."""
+    """Leave out bins with probability 0, which no photograph of the object shows."""
     left = ([number for number in group if float(p[number - 1]) > 0.0] for group in groups)
     return [group for group in left if group]
 
 
 def _group_of(groups: Bins, bins: int) -> Int[Tensor, "k"]:
-    """Return the position of every bin's group; 0 for bins in none."""
+    """Return the index of every bin's group; 0 for bins in none."""
     found = torch.zeros(bins, dtype=torch.long)
     for g, group in enumerate(groups):
         found[torch.tensor(group) - 1] = g
@@ -266,7 +269,7 @@ def _group_of(groups: Bins, bins: int) -> Int[Tensor, "k"]:
 
 
 def _within(p: Float[Tensor, "k"], groups: Bins) -> Float[Tensor, "k g"]:
-    """Return the distribution over the bins of every group, one column each, according to ``p``."""
+    """Return the distribution ``p`` within each group, as one column over all bins."""
     matrix = torch.zeros(len(p), len(groups), dtype=torch.float64)
     for g, group in enumerate(groups):
         rows = torch.tensor(group) - 1

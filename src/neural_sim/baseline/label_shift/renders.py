@@ -1,4 +1,4 @@
-"""Crops of renders whose scene parameters are known, from a pool of all bins that is rendered once."""
+"""Crops of renders with known scene parameters, from a pool of all bins that is rendered once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neural_sim.synthesis.scene import Scene
 
 
 def pool_for(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
-    """Return the scene itself if its renders are pooled, else one with renders of all its bins and lights."""
+    """Return the scene itself if its renders are pooled, otherwise a pool of renders of all its bins and lights."""
     if all(isinstance(subject, PooledSubject) for subject in scene.subjects):
         return scene
     return pool_of(scene, per_bin, generator, lights=scene.distribution.lights > 0)
@@ -30,7 +30,7 @@ def parted(pool: Scene, held_out: float) -> tuple[Scene, Scene]:
         count = min(max(1, round(held_out * subject.per_cell)), subject.per_cell - 1)
         if count < 1:
             raise ValueError(
-                f"label_shift: want two renders of every combination of bins, got {subject.per_cell}"
+                f"label_shift: want at least two renders of every combination of bins, got {subject.per_cell}"
             )
         within = torch.arange(len(subject.maps)) % subject.per_cell
         for side, rows, each in zip(
@@ -44,10 +44,10 @@ def parted(pool: Scene, held_out: float) -> tuple[Scene, Scene]:
 
 @dataclass(frozen=True)
 class _Bank:
-    """Backgrounds that are drawn once and shown mirrored at random.
+    """Backgrounds that are drawn once, then chosen and mirrored at random.
 
-    Drawing them takes three times as long as the rest of an image, and a classifier needs different backgrounds for
-    each bin, not for each image.
+    Drawing a background takes three times as long as the rest of an image, and a classifier needs varied backgrounds
+    for every bin, but not a new one for every image.
     """
 
     images: Float[Tensor, "n 3 height width"]
@@ -64,14 +64,14 @@ class _Bank:
 
 
 def with_bank(scene: Scene, backgrounds: int, generator: torch.Generator) -> Scene:
-    """Return the scene with ``backgrounds`` backgrounds that are drawn now."""
+    """Return the scene with a fixed stock of ``backgrounds`` backgrounds, which are drawn now."""
     own, camera = scene.synthesizer, scene.camera
     images = own.background.draw(backgrounds, camera.height, camera.width, generator)
     return replace(scene, synthesizer=replace(own, background=_Bank(images)))
 
 
 def known_crops(part: Scene, compositions: int, generator: torch.Generator, whole: bool) -> Known:
-    """Compose images of uniform bins and cut out their boxes."""
+    """Compose images with all bins equally frequent, and cut out their boxes."""
     distribution, subject = part.distribution, part.subjects[0]
     assert isinstance(subject, PooledSubject)
     psi = distribution.uniform_of([subject.name for subject in part.subjects])

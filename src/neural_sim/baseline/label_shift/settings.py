@@ -1,4 +1,4 @@
-"""Settings of the estimate by label shift, which is a method of its own and the psi loop's first step."""
+"""Settings of the estimate by label shift, which is a method of its own or the psi loop's first step."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ class LabelShift:
 
     Args:
         per_bin: number of renders of every bin and object, if the scene has no pool of them yet.
-        held_out: fraction of the renders that calibrates and tests instead of training.
-        compositions: average number of images in which each render is shown, over different backgrounds.
-        backgrounds: number of backgrounds that these images share.
+        held_out: fraction of the renders that is held out from training, for calibration and tests.
+        compositions: average number of images that show each render, on different backgrounds.
+        backgrounds: number of backgrounds from which these images choose.
         fitting: how the classifier is trained.
-        augmentation: random changes of its crops.
+        augmentation: random changes of the crops on which it is trained.
         prior: number of boxes that the Dirichlet prior adds to every bin.
-        level: level of the test against the present psi: the fraction of objects at their target that move by chance.
-        draws: number of draws for the test's bootstrap and for the intervals.
+        level: significance level of the test whether the target differs from the present psi: the fraction of objects
+            already at their target that move by chance.
+        draws: number of draws for the bootstrap of the test and, for lights, for the intervals.
         interval: coverage probability of the intervals.
         strange: largest probability that a box looks less like the renders than a held-out render does; above it, the
-            object's psi does not move.
-        doubt: largest expected total variation between an estimate and the target's distribution; above it, psi
-            does not move.
+            object's psi does not move. If psi has lights only, the limit is ``reading.BEYOND_ALL`` instead.
+        doubt: largest expected total variation between an estimate and the target's distribution; above it, psi does
+            not move.
         skill: smallest accuracy on held-out renders, on a scale from 0 (chance) to 1; below it, psi does not move.
-        fewest: smallest number of boxes of an object at which its psi may move.
+        fewest: smallest number of an object's boxes with which its psi may move.
         name: name in reports.
     """
 
