@@ -130,7 +130,7 @@ def test_the_target_s_distribution_is_known_where_it_is_rendered_or_stated(
     if known:
         assert torch.equal(graph.stated_psi("target", "export.psi"), graph.psi("target"))
         return
-    with pytest.raises(ValueError, match=r"^export\.psi=target: no distribution of the target is known"):
+    with pytest.raises(ValueError, match=r"^export\.psi=target: the target's distribution is unknown"):
         graph.stated_psi("target", "export.psi")
 
 

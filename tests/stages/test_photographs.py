@@ -88,8 +88,8 @@ def test_as_many_photographs_are_the_same_training_however_they_were_asked_for(m
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["training.real.mode=combined", "target.train_per_object=0"], "combined wants labelled photographs"),
-        (["training.real.mode=pretrain", "target.train_per_object=0"], "pretrain wants labelled photographs"),
+        (["training.real.mode=combined", "target.train_per_object=0"], "combined needs labelled photographs"),
+        (["training.real.mode=pretrain", "target.train_per_object=0"], "pretrain needs labelled photographs"),
     ],
 )
 def test_what_cannot_be_is_refused_before_any_stage(overrides, message):

@@ -67,7 +67,7 @@ def test_nothing_trains_on_debris_unless_told(root, tmp_path, monkeypatch):
     walk(context, tasks)  # the page itself is written
     assert "unusable" in (tmp_path / "objects.html").read_text()
     with pytest.raises(
-        ValueError, match=r"can: its field has 12\.3 dB .*objects\.html.*objects\.poor=use goes on"
+        ValueError, match=r"can: its field has 12\.3 dB .*objects\.html.*objects\.poor=use accepts it"
     ):
         context.results(subject)
     context, _ = started(root, tmp_path, "objects.poor=use")

@@ -76,6 +76,6 @@ def test_what_another_run_is_making_comes_last(tmp_path, caplog):
             made.append(results(stage))
     assert made == [1, 2, 3]
     assert [record.getMessage() for record in caplog.records] == [
-        "number 0: another run is making it; it comes later"
+        "number 0: another run is making it; this run returns to it later"
     ]
     assert [results(stage) for stage in Results(store).free_first(stages)] == [0, 1, 2, 3]

@@ -57,12 +57,12 @@ def _summed(content):
         (b"half written", "no sum"),
         (b"", "no sum"),
         (b"\x80\x04N.", "no sum"),
-        (_saved({"value": 1, "seconds": 1.0}), "no sum of its content, as entries of older versions"),
+        (_saved({"value": 1, "seconds": 1.0}), "no checksum, like entries of older versions"),
         (_summed([1]), "holds a list"),
         (_summed(3.0), "holds a float"),
         (_summed(torch.zeros(2)), "holds a Tensor"),
         (_summed({"value": 1}), "holds a dict, want value and seconds"),
-        (_summed({"value": Path("a"), "seconds": 1.0}), "holds other than tensors"),
+        (_summed({"value": Path("a"), "seconds": 1.0}), "holds something other than tensors"),
         (_header(hashlib.sha256(b"").hexdigest(), 0), "cannot be read"),
     ],
 )
@@ -200,7 +200,7 @@ def test_unfinished_work_is_found_until_its_result_stands(tmp_path):
 
 
 @pytest.mark.parametrize("change", [_flip, _truncate, _clear, None])
-def test_a_damaged_checkpoint_is_set_aside_and_the_work_begins_anew(tmp_path, caplog, change):
+def test_a_damaged_checkpoint_is_set_aside_and_the_work_starts_again(tmp_path, caplog, change):
     store, path = Store(tmp_path), tmp_path / "field" / "a.checkpoint"
     _resumed(store)
     if change is not None:
@@ -208,7 +208,7 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_work_begins_anew(tmp_path, ca
     # A class that the reader does not expect may run code when it is made.
     assert _resumed(store, (Stand,) if change else ()) is None
     (record,) = caplog.records
-    assert f"{path} is damaged" in record.getMessage() and "begins anew" in record.getMessage()
+    assert f"{path} is damaged" in record.getMessage() and "starts again" in record.getMessage()
     assert (tmp_path / "field" / "a.checkpoint.damaged").is_file()
     assert _resumed(store)["at"] == 7
 

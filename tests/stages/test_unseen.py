@@ -51,7 +51,7 @@ def test_a_class_that_no_training_image_shows_is_named(caplog, monkeypatch):
         DetectorStage.make(cast(Any, stage), cast(Any, lambda _: None))
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith(
-        "detector trained on psi: no drawn image shows can, which it cannot learn: want it nearer"
+        "detector trained on psi: no drawn image shows can, which it therefore cannot learn: want shorter distances"
     )
 
 

@@ -74,7 +74,7 @@ def test_a_tracking_store_that_fails_costs_a_line(context, capsys, caplog):
     assert json.loads((context.folder / "mine.json").read_text()) == [1]
     assert capsys.readouterr().out == f"# Mine\nresults: {context.folder}\n"
     (line,) = (record.getMessage() for record in caplog.records)
-    assert "mlflow.db is not an SQLite database" in line and line.endswith("MLflow has no run of this")
+    assert "mlflow.db is not an SQLite database" in line and line.endswith("not in MLflow")
 
 
 def test_a_full_disk_is_told_with_the_folder_that_was_written_to(context):

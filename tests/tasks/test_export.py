@@ -162,7 +162,7 @@ REFUSED = [
     (["export.image_format=gif"], r"export\.image_format: want one of jpg, png, got 'gif'"),
     (["export.workers=-1"], r"export\.workers: want at least 0 or null, got -1"),
     (["export.psi=/none"], r"export\.psi: want learned, initial, target, a run's folder.*, got /none, which does not"),
-    (lambda path: [results(path, "{")], r"export\.psi: .*results\.json is no results\.json or psi\.json"),
+    (lambda path: [results(path, "{")], r"export\.psi: .*results\.json is not a results\.json or psi\.json"),
     (lambda path: [results(path, {"psi": {"pitcher": {"pose": [0.125] * 8}}})],
      r"export\.psi: .*results\.json has no psi of drill; want objects \['pitcher', 'drill'\] with \['pose'\]"),
     (lambda path: [results(path, {"psi": {name: {"pose": [0.5] * 2} for name in ("pitcher", "drill")}})],
@@ -233,7 +233,7 @@ def test_what_finer_fields_cost_is_said_before_they_are_fitted(made, base):
     graph, results = context.graph, context.results
     finer = finer_fields(graph, reframed(graph.camera, 384, 384), 192)
     assert cost_of(finer, graph.fields, results) == (
-        "2 finer fields to fit first, with 4.0 times the steps and views of 16 times the pixels of the run's own; "
-        "export.detail=run takes those instead"
+        "2 finer fields to fit first, each with 4.0 times the steps and 16 times the pixels of a field of the run; "
+        "export.detail=run uses the run's fields instead"
     )
     assert cost_of(graph.fields, graph.fields, results) == ""

@@ -29,7 +29,7 @@ class Omission:
 
 @dataclass
 class Account:
-    """Seconds by phase of a run, and the work that was left out.
+    """Seconds that a run spent in each phase, and the work that it left out.
 
     A phase is charged for the time from its start to its end, excluding the phases inside it: time spent on a field
     counts for the field, whichever phase asks for it.

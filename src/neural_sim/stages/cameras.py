@@ -46,7 +46,7 @@ class CommandMasksStage(_StoredMasks):
     Args:
         object: name of the object.
         content: digest of its photographs.
-        command: the program.
+        command: the command that runs the program.
         source: the photographs.
     """
 
@@ -71,14 +71,14 @@ class CommandMasksStage(_StoredMasks):
 class CamerasStage(Stage[FoundCapture]):
     """The cameras of an object's photographs, computed from the photographs.
 
-    They do not depend on the run's seed, so that runs share them.
+    They do not depend on the run's seed, so runs with different seeds share them.
 
     Args:
         object: name of the object.
         content: digest of the photographs, the masks and their options.
         finder: method that finds the cameras.
         source: the photographs.
-        masks: masks computed by a command, which may show where the object is.
+        masks: masks computed by a command, which may restrict the search to the object.
         progress: whether to show a progress bar.
     """
 
@@ -143,7 +143,7 @@ def _lens(stored: list[Any]) -> Lens:
 class MasksStage(_StoredMasks):
     """Masks computed from the geometry of the scene, one for each photograph of an object that has a camera.
 
-    They do not depend on the run's seed, so that runs share them.
+    They do not depend on the run's seed, so runs with different seeds share them.
 
     Args:
         object: name of the object.
@@ -179,8 +179,8 @@ def command_masks(source: Photos, name: str) -> CommandMasksStage | None:
 def with_cameras(source: Photos, results: Results, progress: bool = False) -> Photos:
     """Return photographs with their cameras, which are computed if they are not given.
 
-    Cameras come first because everything else depends on them, such as which bins photographs show and how many
-    photographs can be used.
+    Cameras are computed first because everything else depends on them, for example the bins that the photographs show
+    and the number of usable photographs.
 
     Raises:
         ValueError: the cameras of some photographs cannot be found.

@@ -1,4 +1,4 @@
-"""Describe settings as plain JSON for keys: constructor arguments of objects, and the modules whose code they run."""
+"""Describe settings as plain JSON, from which keys are computed, and find the modules whose code they run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def describe(value: Any) -> Any:
             if "digest" in described:
                 return described
             raise TypeError(
-                f"key: cannot describe {type(value).__qualname__}, its settings are no attributes"
+                f"key: cannot describe {type(value).__qualname__}: its constructor arguments are not attributes"
             )
     return described | {name: describe(getattr(value, name)) for name in names}
 

@@ -21,13 +21,13 @@ from neural_sim.types import PinholeCamera
 _log = logging.getLogger(__name__)
 
 ENOUGH = 1.25
-"""The run's own fields serve images with up to this many times the resolution of their views."""
+"""The run's own fields are used for images of up to this many times the resolution of their views."""
 
 
 def view_size_for(
     views: Views, camera: PinholeCamera, distribution: SceneDistribution, largest_radius: float
 ) -> int:
-    """Return the side in pixels at which the closest views resolve as much as ``camera`` does.
+    """Return the image size, in pixels, at which the closest views resolve as much detail as ``camera``.
 
     The camera is taken at its smallest distance and longest focal length. ``largest_radius`` is the radius of the
     largest object, in the unit of the distribution's distances.
@@ -61,9 +61,9 @@ def finer_recipe(recipe: FieldRecipe, factor: float) -> FieldRecipe:
 
 
 def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[FieldStage, ...]:
-    """Return the run's fields, or finer ones where images of ``camera`` would show the pixels of the run's views.
+    """Return the run's fields, or finer ones if images of ``camera`` would show the pixels of the run's views.
 
-    Finer views have at most ``largest`` pixels a side. The log says what the views hold.
+    Finer views have at most ``largest`` pixels a side. The log states the resolution that is needed and used.
     """
     views, recipe = graph.experiment.imaging.views, graph.experiment.imaging.field
     if not graph.objects.has_meshes:
@@ -79,9 +79,9 @@ def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[Fie
         else views.image_size
     )
     _log.info(
-        "export: images of %d x %d resolve what views of %d pixels a side do; fields are fitted to views of %d%s",
+        "export: images of %d x %d resolve as much as views of %d pixels a side; fields are fitted to views of %d%s",
         camera.width, camera.height, wanted, size,
-        f" (export.largest_views; a pixel of theirs covers {wanted / size:.1f} of an image's)" if size < wanted else "",
+        f" (export.largest_views; each pixel covers {wanted / size:.1f} of an image's)" if size < wanted else "",
     )  # fmt: skip
     if size == views.image_size:
         return graph.fields
@@ -93,15 +93,15 @@ def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[Fie
 
 
 def cost_of(finer: Sequence[FieldStage], own: Sequence[FieldStage], results: Results) -> str:
-    """Say what finer fields cost, before they are fitted.
+    """Return a sentence on what finer fields cost, for the log before they are fitted.
 
     Args:
         finer: the fields that an export wants.
         own: the run's own fields.
-        results: results that exist already.
+        results: tells which fields the store lacks.
 
     Returns:
-        A sentence; empty where the store has all finer fields, or where they are the run's own.
+        The sentence; empty if the store has all finer fields, or if they are the run's own.
     """
     missing = 0 if list(finer) == list(own) else sum(stage in finer for stage in results.missing(finer))
     if not missing:
@@ -109,6 +109,6 @@ def cost_of(finer: Sequence[FieldStage], own: Sequence[FieldStage], results: Res
     steps = finer[0].recipe.steps / own[0].recipe.steps
     pixels = (finer[0].views.settings.image_size / own[0].views.settings.image_size) ** 2
     return (
-        f"{missing} finer field{'s' if missing > 1 else ''} to fit first, with {steps:.1f} times the steps and views "
-        f"of {pixels:.0f} times the pixels of the run's own; export.detail=run takes those instead"
+        f"{missing} finer field{'s' if missing > 1 else ''} to fit first, each with {steps:.1f} times the steps and "
+        f"{pixels:.0f} times the pixels of a field of the run; export.detail=run uses the run's fields instead"
     )

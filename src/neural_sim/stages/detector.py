@@ -35,7 +35,7 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class TrainedDetector:
-    """Parameters, and the cost of rendering and training. Fields are excluded, since all methods use them."""
+    """Parameters, and the cost of rendering and training. The cost excludes fields, since all methods use them."""
 
     params: Parameters
     cost: Cost
@@ -79,10 +79,10 @@ class TrainedStage(Stage[TrainedDetector]):
 
 @dataclass(frozen=True)
 class DetectorStage(TrainedStage):
-    """A detector trained from scratch on images drawn from psi, with the same budget for every method.
+    """A detector trained from its initial parameters on images drawn from psi, with the same budget for every method.
 
     ``probabilities`` is the digest of p, see ``SceneDistribution.digest_of``; ``phase`` is the phase of the run that
-    needs the detector, ``called`` describes psi in messages. ``targets`` are the target sets whose photographs are
+    needs the detector; ``called`` describes psi in messages. ``targets`` are the target sets whose photographs are
     mixed into the training if ``training.real`` says so, else None.
     """
 
@@ -114,19 +114,19 @@ class DetectorStage(TrainedStage):
         return self.scene.camera
 
     def photographs(self, results: Results) -> LabelledImages | None:
-        """Return the photographs that train together with the drawn images, None if there are none."""
+        """Return the photographs that are mixed with the drawn images, None if there are none."""
         if self.targets is None:
             return None
         return self.training.real.chosen(results(self.targets).train, self.seed)
 
     def images(self, results: Results, generator: torch.Generator | None = None) -> RenderedImages:
-        """Return the training images, the same in every call."""
+        """Return the training images; without a ``generator``, they are the same in every call."""
         generator = self.generator() if generator is None else generator
         scene: TrainingImages = results(self.scene)
         return scene.training_set(self.psi, self.training.images_per_object, generator)
 
     def generator(self) -> torch.Generator:
-        """Return the generator of images, initial parameters and the order of training."""
+        """Return a new generator, from which images, initial parameters and the order of training are drawn."""
         return stream(self.seed, "detector")
 
     @override
@@ -137,8 +137,9 @@ class DetectorStage(TrainedStage):
         images, sampling = self.images(results, generator).images.to(self.device), None
         if unseen := unshown(images, self.names):
             _log.warning(
-                "%s: no drawn image shows %s, which it cannot learn: want it nearer (parameter, unlearned), larger "
-                "images (training.image_size), or a smaller synthesis.minimum_area", self.title, ", ".join(unseen),
+                "%s: no drawn image shows %s, which it therefore cannot learn: want shorter distances (parameter, "
+                "unlearned), larger images (training.image_size), or a smaller synthesis.minimum_area",
+                self.title, ", ".join(unseen),
             )  # fmt: skip
         drawn, photographs = len(images), self.photographs(results)
         if photographs is not None:
@@ -164,10 +165,10 @@ class DetectorStage(TrainedStage):
 
 @dataclass(frozen=True)
 class PhotographsStage(TrainedStage):
-    """A detector trained on photographs of the target: from scratch (``start`` None), or fine-tuned from ``start``.
+    """A detector trained on the target's photographs from its initial parameters, or fine-tuned from ``start``.
 
-    There are ``epochs`` epochs of ``steps`` steps, in shuffled passes over the photographs. Batches have the size in
-    ``training``, or all photographs if there are fewer.
+    Training takes ``epochs`` epochs of ``steps`` steps, which pass over the photographs in shuffled order. A batch has
+    the size in ``training``, or contains all photographs if there are fewer.
     """
 
     phase: ClassVar[str] = "evaluate"

@@ -21,13 +21,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Scores:
-    """Average precision or accuracy on a part of the target set, and the detections in every image."""
+    """Average precision or accuracy on a part of the target sets, and the detections in every image."""
 
     ap: TestScore
     detections: list[dict[str, Tensor]]
-
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,9 @@ from neural_sim.types import PinholeCamera
 from neural_sim.workers import Workers
 
 SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
-"""Score of the detectors, by task."""
+"""The score of each task's detectors."""
 _OBJECTIVES = {"AP": ("smooth_ap", SmoothAP), "accuracy": ("smooth_accuracy", SmoothAccuracy)}
-"""Objective of the psi loop, other than the loss, for detectors with each score: choice in the group, and class."""
+"""For each score, the objective of the psi loop other than the loss: choice of ``outer/objective``, and class."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,7 @@ class Run:
             require("ray", "workers=ray")
         elif self.workers > 1 and self.accelerator != "cpu":
             raise UserError(
-                "workers: want 1 or ray with trainer=gpu, which all processes would share, got "
-                f"{self.workers}"
+                f"workers: want 1 or ray with trainer=gpu, got {self.workers} processes, which would share the GPU"
             )
 
     @property
@@ -124,9 +123,9 @@ class Experiment:
     report writes for the final detector.
 
     Raises:
-        ValueError: the detector, the objective or the images do not fit the task; the first hypergradient is taken at a
-            warm start on another distribution than the initial psi; or the method compares trainings, and each
-            continues from the one before.
+        ValueError: the detector, the objective or the images do not fit the task; the first hypergradient would be
+            taken at a warm start that was not trained on the initial psi; or the method compares trainings, and each of
+            them continues the one before.
     """
 
     run: Run
@@ -142,7 +141,7 @@ class Experiment:
         if score != SCORES.get(task):
             choices = ", ".join(f"task={name} ({own})" for name, own in SCORES.items())
             raise ValueError(
-                f"task={task} and a detector that is scored by {score} do not belong together: want {choices}, and "
+                f"task={task} does not go with a detector that is scored by {score}: want {choices}, and "
                 "detector=classifier for accuracy"
             )
         method = self.loop.method
@@ -150,8 +149,8 @@ class Experiment:
             method, (Fixed, LabelShift, HypergradientLoop)
         ):
             raise ValueError(
-                f"baseline={method.name} compares trainings, and under outer.start=previous (of +variant=paper) later "
-                "ones score more whatever psi is: add outer.start=warm"
+                f"baseline={method.name} compares trainings, and with outer.start=previous (as in +variant=paper) "
+                "later ones score higher whatever psi is: add outer.start=warm"
             )
         name, wanted = _OBJECTIVES[score]
         if not isinstance(objective, (wanted, Loss)):

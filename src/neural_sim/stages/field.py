@@ -22,7 +22,7 @@ EVERY = 60.0
 
 @dataclass(frozen=True)
 class FittedField:
-    """A field, and the history of its scores on held-out views over steps and seconds."""
+    """A field, and its scores on held-out views during the fit, with the steps and seconds at which they were taken."""
 
     field: RadianceField
     history: list[dict[str, Any]]
@@ -65,8 +65,8 @@ class FieldStage(Stage[FittedField]):
         if fitted.poor and self.views.objects.refuses_poor:
             raise ValueError(
                 f"{self.views.object}: its field has {fitted.psnr:.1f} dB on the object in held-out photographs, want "
-                f"at least {POOR:g}: renders of it would train for something else. stages=[field] shows it in "
-                "objects.html; objects.box, objects.masks and sharper photographs help, objects.poor=use goes on"
+                f"at least {POOR:g}: its renders do not show the object. stages=[field] shows the field in "
+                "objects.html; objects.box, objects.masks and sharper photographs help; objects.poor=use accepts it"
             )
         return fitted.field
 

@@ -29,7 +29,7 @@ class Graph(Images):
 
     Args:
         experiment: the experiment.
-        on_record: called with the record of each iteration of the psi loop when it ends.
+        on_record: called at the end of each iteration of the psi loop, with its record.
 
     Raises:
         ValueError: a setting names an object that the source lacks, or asks to train on photographs of a target that
@@ -43,13 +43,13 @@ class Graph(Images):
         real = self.experiment.training.real
         if real.used and not self.experiment.imaging.target.trains:
             raise ValueError(
-                f"training.real.mode={real.mode} wants labelled photographs: set target.train_fraction (of a target of "
-                "photographs) or target.train_per_object (of a rendered one)"
+                f"training.real.mode={real.mode} needs labelled photographs: set target.train_fraction (for a target "
+                "of photographs) or target.train_per_object (for a rendered one)"
             )
 
     @cached_property
     def warm_start(self) -> DetectorStage:
-        """The detector whose backbone the psi loop trains on, and that some methods start from.
+        """The detector whose backbone every training of the psi loop starts from.
 
         If it is trained on the initial distribution, for as many epochs as scored detectors, and these are not
         fine-tuned, it is also the detector scored as ``ns``.
@@ -67,7 +67,7 @@ class Graph(Images):
 
     @cached_property
     def _training(self) -> Training:
-        """The training settings in the form that enters the keys of detectors, without irrelevant differences.
+        """The training settings as they enter the keys of detectors, without differences that have no effect.
 
         The distribution of the warm start is left out, because psi says what a detector is trained on. If the target
         knows how many photographs it has, a fraction of them is replaced by their number.
@@ -92,7 +92,7 @@ class Graph(Images):
         )  # fmt: skip
 
     def _on_photographs(self, start: DetectorStage | None) -> PhotographsStage:
-        """Return a detector trained on photographs alone, in as many steps as on images, or fine-tuned on them."""
+        """Return ``start`` fine-tuned on photographs; None: a detector trained on them alone, for as many steps."""
         x, training, real = self.experiment, self._training, self._training.real
         steps = -(-training.images_per_object * len(self.names) // training.batch_size)
         epochs = training.cold_epochs
@@ -124,13 +124,13 @@ class Graph(Images):
 
     @cached_property
     def pool(self) -> PoolStage:
-        """Renders of all bins, from which the loop composes images and the reader of the target's boxes is trained."""
+        """Renders of all bins, for the images of the psi loop and for the classifier of the target's boxes."""
         x = self.experiment
         return PoolStage(self.scene, self._reading.per_bin, x.loop.outer.quality, x.run.seed)
 
     @cached_property
     def shown(self) -> ShownStage:
-        """The psi estimated from the target's boxes, with the settings of the method if it estimates."""
+        """The psi estimated from the target's boxes, with the method's settings if the method is label shift."""
         x, settings = self.experiment, self._reading
         return ShownStage(
             self.pool, self.targets, self._symmetries, x.imaging.distribution, settings, self.psi("initial"),
@@ -146,7 +146,7 @@ class Graph(Images):
 
     @property
     def read_warm_start(self) -> tuple[DetectorStage, ...]:
-        """The warm start, unless the method does not need it."""
+        """The warm start, in a tuple; empty for label shift, which does not need it."""
         return () if isinstance(self.experiment.loop.method, LabelShift) else (self.warm_start,)
 
     @cached_property
@@ -185,10 +185,10 @@ class Graph(Images):
     def compared(self, learned: LearnedPsi) -> dict[str, ScoresStage]:
         """Return the scores that a run reports, by name.
 
-        There are detectors of the initial distribution (``ns``), the ``learned`` one and, if known, the target's own
-        (``matched``). If photographs are used in training, there are also detectors trained on the learned distribution
-        without them (``synthetic_only``), on photographs alone (``real_only``) and on the views that fields are fitted
-        to (``views_only``).
+        They belong to detectors trained on the initial distribution (``ns``), the ``learned`` one and, if known, the
+        target's own (``matched``). If photographs are used in training, there are also detectors trained on the learned
+        distribution without them (``synthetic_only``), on photographs alone (``real_only``) and on the views that
+        fields are fitted to (``views_only``).
         """
         psis = {"ns": self.psi("initial"), "learned": learned.last, "matched": self.target_psi}
         rows = {called: self.scores(psi, called) for called, psi in psis.items() if psi is not None}

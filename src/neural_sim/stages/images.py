@@ -41,7 +41,7 @@ class Images:
         unknown = {*imaging.distribution.biased, *(loop.outer.learned or ())} - set(self.names)
         if unknown:
             raise ValueError(
-                f"biased or outer.learned names {sorted(unknown)}, objects are {list(self.names)}"
+                f"parameter.*.biased or outer.learned: want some of {list(self.names)}, got {sorted(unknown)}"
             )
 
     @cached_property
@@ -66,7 +66,7 @@ class Images:
 
     @cached_property
     def radii(self) -> tuple[float, ...] | None:
-        """The radii of the objects in metres; None if distances are in radii, so that objects need not be read."""
+        """The radii of the objects in metres; None if distances are in radii, since objects need not be read then."""
         distribution = self.experiment.imaging.distribution
         return None if distribution.distance_unit == "radii" else distribution.radii(self.objects.radii)
 
@@ -84,7 +84,7 @@ class Images:
 
     @cached_property
     def qualities(self) -> tuple[QualityStage, ...]:
-        """How well each object's field shows the object."""
+        """Scores and pictures of every object's field."""
         imaging, radii = self.experiment.imaging, self.radii or (None,) * len(self.fields)
         camera, distribution = imaging.views.camera(THUMBNAIL), imaging.distribution
         return tuple(
@@ -157,7 +157,7 @@ class Images:
         return self.psi("target") if known else None
 
     def stated_psi(self, which: Literal["initial", "target"], key: str) -> Psi:
-        """Return the initial psi or the target's, as the configuration key ``key`` asks for.
+        """Return the initial psi or the target's; ``key`` is the configuration key that asks for it.
 
         Raises:
             ValueError: the target's psi is unknown.
@@ -165,7 +165,7 @@ class Images:
         psi = self.psi("initial") if which == "initial" else self.target_psi
         if psi is None:
             raise ValueError(
-                f"{key}=target: no distribution of the target is known, because its images are photographs and no "
+                f"{key}=target: the target's distribution is unknown, because its images are photographs and no "
                 "parameter.*.target says what they show"
             )
         return psi

@@ -44,7 +44,7 @@ _STATE = (
     Average, Certificate, FactorEstimate, ImplicitQuality, IterationRecord, Stay, TakenBack, UnrolledQuality,
     UpdateState, Verdict,
 )  # fmt: skip
-"""Dataclasses in the state of a loop, see ``OuterLoop.state``."""
+"""Dataclasses that may occur in the state of a loop, see ``OuterLoop.state``."""
 Method = Fixed | LabelShift | HypergradientLoop | Response | RewardMethod
 
 
@@ -60,10 +60,10 @@ class HypergradientParts:
 class PsiStage(Stage[LearnedPsi]):
     """The psi that ``method`` learns from the initial distribution.
 
-    Inputs that the method does not use are None: ``parts`` for methods that follow the hypergradient, ``pool`` with the
-    renders that a loop reuses, ``shown`` with the estimate from the target's boxes. ``symmetries`` are the groups of
-    bins that ``outer.first_step`` cannot tell apart in the boxes. ``on_record`` is called with the record of each
-    iteration when it ends.
+    ``pool`` has the renders that a loop reuses. ``parts`` is for methods that follow the hypergradient and ``shown``,
+    the estimate from the target's boxes, for label shift; both are None for other methods. ``symmetries`` are the
+    groups of bins that ``outer.first_step`` cannot tell apart in the boxes. ``on_record`` is called at the end of each
+    iteration with its record.
 
     Raises:
         ValueError: the backbone has fewer stages than ``outer.loop_layers``, or the detector has too many parameters
@@ -96,7 +96,7 @@ class PsiStage(Stage[LearnedPsi]):
             size = sum(value.numel() for value in trained.values())
             if size > largest:
                 raise ValueError(
-                    f"solver=exact takes {largest} unknowns (solver.linear.max_size), and the detector has {size}: "
+                    f"solver=exact takes up to {largest} unknowns (solver.linear.max_size), the detector has {size}: "
                     "want solver=cg or detector=micro"
                 )
 
@@ -114,7 +114,7 @@ class PsiStage(Stage[LearnedPsi]):
 
     @property
     def draws(self) -> Draws:
-        """How images are drawn: as the estimator of the method needs them, or exactly if it has none."""
+        """How images are drawn: as the method's estimator needs them, or as hard draws if it has none."""
         return HARD if self.parts is None else self.parts.estimator.draws
 
     @override
@@ -158,7 +158,7 @@ class PsiStage(Stage[LearnedPsi]):
         return RewardLoop(inner, self.initial, method, generator)
 
     def _first_step(self, results: Results, whole: bool) -> FirstStep | None:
-        """Return the proposal for the first step of the loop; None: it follows the first derivative."""
+        """Return the proposal for the first step of the loop, None if that follows the derivative."""
         settings = self.outer.first_step
         if isinstance(settings, Derivative):
             return None

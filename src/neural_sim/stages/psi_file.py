@@ -38,7 +38,7 @@ def psi_of_file(
             f"{key}: {file} has no psi of {error.args[0]}; want objects {list(names)} with {list(distribution.names)}"
         ) from error
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{key}: {file} is no results.json or psi.json ({error})") from error
+        raise ValueError(f"{key}: {file} is not a results.json or psi.json ({error})") from error
     psi = []
     for name, row in zip(names, rows, strict=True):
         parts = []
@@ -56,7 +56,7 @@ def psi_of_file(
 
 
 def _numbers(stored: Any, name: str, factor: str) -> list[float]:
-    """Return the numbers of a factor from ``psi.json``, or the learned ones of the three in ``results.json``."""
+    """Return the numbers of a factor from ``psi.json``, or the learned ones from ``results.json``."""
     if name not in stored:
         raise KeyError(name)
     if factor not in stored[name]:

@@ -1,4 +1,4 @@
-"""Stage ``quality``: scores and pictures that show whether a field shows its object."""
+"""Stage ``quality``: scores and pictures that tell how well a field shows its object."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from neural_sim.synthesis.thumbnails import bin_thumbnails
 from neural_sim.types import PinholeCamera
 
 SHOWN = 4
-"""Number of held-out views on a page."""
+"""Largest number of held-out views on a page."""
 
 
 @dataclass(frozen=True)
 class QualityStage(Stage[Quality]):
     """Scores and pictures of the field of one object.
 
-    The key covers ``drawn``, the settings that draws depend on, not the distribution; ``camera`` takes the pictures of
-    bins.
+    The key covers ``drawn``, the settings that draws depend on, instead of ``distribution``; ``camera`` takes the
+    pictures of bins.
     """
 
     phase: ClassVar[str] = "field"

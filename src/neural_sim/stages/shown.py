@@ -27,7 +27,7 @@ class ShownStage(Stage[Estimate]):
     """The label-shift estimate from the target's validation images.
 
     ``symmetries`` are the groups of bins that look the same; ``psi`` is the current psi, which the estimate is tested
-    against; with ``whole``, images are read as a whole, since they have no boxes.
+    against; with ``whole``, whole images are read instead of boxes, which a classifier's images do not have.
     """
 
     phase: ClassVar[str] = "psi"

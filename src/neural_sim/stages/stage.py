@@ -1,4 +1,4 @@
-"""Stages, which define their inputs, their key and how their result is made and stored; and their evaluation."""
+"""Stages, each with its inputs, its key and how its result is made and stored; and the evaluation of stages."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ UNKEYED = {"key": False}
 
 
 class Stage(ABC, Generic[T]):
-    """A frozen dataclass. Its fields that are stages, alone or in a tuple, are its inputs; the rest are settings.
+    """One step of a run, as a frozen dataclass. Fields that are stages, or tuples of them, are inputs; others settings.
 
     The key of the result covers the settings, the keys of the inputs, and the version of all code imported by the
-    modules of the stage and its settings. Fields whose metadata is ``UNKEYED`` are left out: they only affect how fast
-    a result is computed, or follow from other fields.
+    modules of the stage and its settings. Fields whose metadata is ``UNKEYED`` are left out: they only affect speed and
+    messages, or their content is covered by other fields.
     """
 
     phase: str
     """The phase of a run that is charged for the result."""
     kind: str
-    """The folder of the store."""
+    """The folder of the store that holds the result."""
     keep: ClassVar[bool] = True
     """Whether a run keeps the result in memory once it has read it."""
     stored: ClassVar[bool] = True
@@ -114,7 +114,7 @@ class Stage(ABC, Generic[T]):
 
 
 class Results:
-    """Evaluates stages: takes a result from memory, reads it from the store, or computes it from those of its inputs.
+    """Evaluates stages: takes a result from memory, reads it from the store, or makes it and stores it.
 
     Args:
         store: store of results.
@@ -149,7 +149,7 @@ class Results:
         return stage.unpack(entry.value)
 
     def seen(self, entry: str) -> None:
-        """Note that this run made a result in another process, so that it is not reported as found in the store."""
+        """Note that another process of this run made a result, so that it is not reported as found in the store."""
         self._seen.add(entry)
 
     def checkpoint(self, stage: Stage[Any], classes: Sequence[type] = (), every: float = 0.0) -> Checkpoint:
@@ -176,7 +176,7 @@ class Results:
         for stage in stages:
             known = stage.entry in self._kept or self.store.has(stage.kind, stage.key)
             if stage.stored and not known and self.store.busy(stage.kind, stage.key):
-                _log.info("%s: another run is making it; it comes later", stage.title)
+                _log.info("%s: another run is making it; this run returns to it later", stage.title)
                 later.append(stage)
             else:
                 yield stage

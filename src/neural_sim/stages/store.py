@@ -1,8 +1,8 @@
 """A content-addressed store of stage results: equal inputs are computed once.
 
 Entries are written under a temporary name and moved into place, so that a killed run leaves no half-written entry.
-A lock keeps two processes from computing the same result: concurrent runs wait for the one that has it, and the lock
-ends with its process.
+A lock keeps two processes from computing the same result: other runs wait for the one that holds the lock, which is
+freed when its process ends.
 
 An entry is a line of text with the SHA-256 and the size of the rest of the file, followed by the output of
 ``torch.save``. Both are checked on every read; an entry that a disk or a copy has damaged is set aside and made again.
@@ -55,8 +55,8 @@ class Audit:
 
     Attributes:
         sound: entries whose content matches their checksum.
-        damaged: entries whose content does not.
-        left: other files: half written by killed runs, or set aside as damaged.
+        damaged: entries whose content does not, or that cannot be read.
+        left: other files, which killed runs left half-written or which were set aside as damaged.
         checkpoints: checkpoints of unfinished work.
         bytes: total size of the sound entries.
     """
@@ -111,8 +111,8 @@ class Store:
     def state(self, kind: str, key: str, classes: Sequence[type] = ()) -> Any:
         """Return the state of unfinished work on the result ``key``, None if there is none.
 
-        Only for the process that makes the result and holds its lock. ``classes`` are the dataclasses that may occur in
-        a state. A damaged checkpoint is set aside, with a warning, and the work starts again.
+        To be called by the process that makes the result and holds its lock. ``classes`` are the dataclasses that may
+        occur in a state. A damaged checkpoint is set aside, with a warning, and the work starts again.
         """
         path = self._path(kind, key).with_suffix(CHECKPOINT)
         try:
@@ -129,7 +129,7 @@ class Store:
                 path.parent.mkdir(parents=True, exist_ok=True)
             _write(path, lambda file: _save(state, file))
         except ValueError as error:
-            _log.warning("%s; the work goes on, and could not be taken up here", error)
+            _log.warning("%s; the work goes on, but a later run could not resume it from here", error)
 
     def forget(self, kind: str, key: str) -> None:
         """Remove the checkpoint of the result ``key``, if there is one."""
@@ -138,11 +138,11 @@ class Store:
             path.unlink(missing_ok=True)
 
     def has(self, kind: str, key: str) -> bool:
-        """Whether the result has a file, without reading it."""
+        """Return whether the store has a file of the result, without reading it."""
         return self._path(kind, key).is_file()
 
     def busy(self, kind: str, key: str) -> bool:
-        """Whether another run is making the result ``key``."""
+        """Return whether another run is making the result ``key``."""
         path = self._path(kind, key)
         if not path.with_suffix(".lock").exists():
             return False
@@ -175,7 +175,7 @@ class _Damage(Exception):
 
 @contextmanager
 def locked(path: Path, wait: bool = True) -> Iterator[bool]:
-    """Lock an entry. The operating system frees the lock when its process ends, in whatever way.
+    """Lock an entry. The operating system frees the lock when its process ends, however it ends.
 
     Yields whether this process got the lock, which is certain only with ``wait``.
     """
@@ -218,7 +218,9 @@ def _content(path: Path, classes: Sequence[type] = ()) -> Any:
     except (
         pickle.UnpicklingError
     ) as error:  # its own message advises weights_only=False, which would run code
-        raise _Damage("it holds other than tensors, numbers, strings, lists and mappings") from error
+        raise _Damage(
+            "it holds something other than tensors, numbers, strings, lists and mappings"
+        ) from error
     except (OSError, RuntimeError, EOFError, ValueError) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise _Damage(f"it cannot be read: {reason}") from error
@@ -228,9 +230,9 @@ def _checked_header(file: BinaryIO) -> int:
     """Check a file against its first line and return the length of that line. Raises ``_Damage``."""
     header = file.readline(len(_header("", 0)))
     if not header.startswith(_HEADER[:16].encode()):
-        raise _Damage("it has no sum of its content, as entries of older versions")
+        raise _Damage("it has no checksum, like entries of older versions")
     if header != _header(_sha256(file), file.tell() - len(header)):
-        raise _Damage("its content is not what its first line says")
+        raise _Damage("its content does not match the checksum and size in its first line")
     return len(header)
 
 
@@ -262,10 +264,10 @@ def _sha256(file: BinaryIO) -> str:
 def _set_aside(path: Path, damage: _Damage) -> None:
     entry = path.suffix == ".pt"
     aside = path.with_suffix(DAMAGED) if entry else path.with_name(path.name + DAMAGED)
-    then = "is made again" if entry else "its work begins anew"
+    then = "the result is made again" if entry else "its work starts again"
     with _writing(path):
         os.replace(path, aside)
-    _log.warning("store: %s is damaged (%s); it is now %s and %s", path, damage, aside.name, then)
+    _log.warning("store: %s is damaged (%s): it was renamed to %s, and %s", path, damage, aside.name, then)
 
 
 def _sweep(path: Path) -> None:
@@ -295,7 +297,7 @@ def _write(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn an error of writing a file into one that names its path."""
+    """Turn an ``OSError`` from writing a file into a ``ValueError`` that names the file."""
     try:
         yield
     except OSError as error:

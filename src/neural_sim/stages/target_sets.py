@@ -87,8 +87,8 @@ class TargetSetsStage(Stage[TargetSets]):
         unseen = unshown(sets.test, self.objects.names)
         if unseen:
             _log.warning(
-                "target: no test image shows %s: scores are of the other objects; want test images of it, or leave it "
-                "out of objects.names", ", ".join(unseen),
+                "target: no test image shows %s: scores cover the other objects only; want test images that show it, "
+                "or objects.names without it", ", ".join(unseen),
             )  # fmt: skip
         return sets
 

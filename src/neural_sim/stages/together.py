@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 def make_together(results: Results, stages: Iterable[Stage[Any]], by: Workers, gpus: float = 0.0) -> None:
-    """Make the stages, and those they need, that the store lacks, each as soon as its inputs are ready.
+    """Make the stages, and those that they need, if the store lacks them; each as soon as its inputs are ready.
 
     Results equal those of one process bit for bit, since every worker uses as many threads as this one. Nothing is made
     if no two of the stages could be made at the same time.
@@ -39,7 +39,7 @@ def make_together(results: Results, stages: Iterable[Stage[Any]], by: Workers, g
         return
     missing = {stage.entry: stage for stage in results.missing(stages) if stage.stored}
     waiting = {name: set(_needed(stage, missing)) for name, stage in missing.items() if _can_be_sent(stage)}
-    # A stage that needs one made by this process is made by this process, too.
+    # A stage that needs a result made by this process is made by this process, too.
     while kept := {name for name, needed in waiting.items() if not needed <= waiting.keys()}:
         waiting = {name: needed for name, needed in waiting.items() if name not in kept}
     if _most_at_once(waiting) < 2:
@@ -91,7 +91,7 @@ def _can_be_sent(stage: Stage[Any]) -> bool:
     try:
         pickle.dumps(stage)
     except (pickle.PicklingError, AttributeError, TypeError):
-        _log.info("%s: made by this process, for it cannot be sent to another", stage.title)
+        _log.info("%s: made by this process, because it cannot be sent to another", stage.title)
         return False
     return True
 

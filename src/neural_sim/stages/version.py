@@ -18,9 +18,9 @@ PACKAGE = ROOT.name
 def code_version(modules: Iterable[str], root: Path = ROOT) -> str:
     """Return a digest of the source of ``modules`` and of all modules of this package that they import, at any depth.
 
-    Comments, layout and docstrings are left out, so that stored results survive edits of prose. Modules outside the
-    package count by their own source, without their imports; the standard library and installed packages without
-    readable source do not count.
+    Comments, layout and docstrings are left out, so that stored results survive edits of prose. A module outside the
+    package counts by its own source, without its imports; modules in site-packages, and those without readable source,
+    do not count.
     """
     total = hashlib.sha256()
     for name in sorted(closure(modules, root)):
@@ -89,7 +89,7 @@ def _text(node: object) -> str:
 
 
 def _source(name: str, root: Path) -> Path | None:
-    """Return the source file of a module; None for builtins, extensions and names that are not modules."""
+    """Return the source file of a module; None in site-packages, for builtins and for names that are not modules."""
     first, *rest = name.split(".")
     if first == root.name:
         place = root.joinpath(*rest)

@@ -41,7 +41,7 @@ DIMMED = 0.25
 
 @dataclass(frozen=True)
 class ViewsStage(Stage[PosedViews]):
-    """Views of one object. They do not depend on the run's seed, so that runs share views and fields.
+    """Views of one object. They do not depend on the run's seed, so runs with different seeds share views and fields.
 
     Args:
         object: name of the object.
@@ -70,7 +70,7 @@ class ViewsStage(Stage[PosedViews]):
 
     @property
     def held_out(self) -> int:
-        """Number of views, at the end, that are only used to score the field."""
+        """Number of views, the last ones, that are used only to score the field."""
         return self.objects.held_out(self.object, self.settings)
 
     def fitted(self, results: Results) -> PosedViews:
@@ -103,7 +103,7 @@ class ViewsStage(Stage[PosedViews]):
 
 @dataclass(frozen=True)
 class Objects(ABC):
-    """The objects of a run by name. No other code depends on what they are made of."""
+    """The objects of a run by name, whether they come from meshes, from photographs or from both."""
 
     source: Source
     has_meshes: ClassVar[bool]
@@ -147,7 +147,7 @@ class Objects(ABC):
         Args:
             name: name of the object.
             field: its radiance field, for objects without meshes.
-            rig: lights with weights for scenes to draw, for objects with meshes.
+            rig: lights whose weights the scene may draw, for objects with meshes.
         """
 
     @abstractmethod
@@ -170,7 +170,7 @@ class Objects(ABC):
     def photographs(
         self, name: str, settings: Views, masks: MasksOfFrames, held_out: Sequence[int]
     ) -> tuple[Float[Tensor, "_ _ 3"], ...]:
-        """Return photographs of some held-out views with dimmed background; none for objects from meshes."""
+        """Return the photographs of some held-out views, with dimmed backgrounds; none for objects from meshes."""
         return ()
 
     def placed(self, name: str, settings: Views, views: PosedViews) -> Placed | None:
@@ -184,7 +184,7 @@ class Objects(ABC):
 
 @dataclass(frozen=True)
 class Meshes(Objects):
-    """Objects from meshes, which are loaded when one is first rendered, and their renderer."""
+    """Objects from meshes, which are loaded when they are first needed, and their renderer."""
 
     has_meshes: ClassVar[bool] = True
 
@@ -220,7 +220,7 @@ class Meshes(Objects):
 
 @dataclass(frozen=True)
 class Captures(Objects):
-    """Objects from photographs, which are rendered by their fields."""
+    """Objects from photographs, which are rendered from their fields."""
 
     has_meshes: ClassVar[bool] = False
 
@@ -263,7 +263,7 @@ class Captures(Objects):
         ]
         own = views.camera_to_world.double().numpy()
         given = np.stack([frame.camera_to_world for frame in frames])
-        # One similarity takes all cameras from the frame of the capture to that of the object, so one view gives it.
+        # A similarity takes the capture's frame to the object's: its scale and centre follow from the camera positions.
         turn = upright(np.array(self.source.up_of(name)), name)
         apart = [np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(0)) for poses in (given, own)]
         radius = float(apart[0] / apart[1])
@@ -329,7 +329,7 @@ class Mixed(Objects):
 
 
 def dimmed(rgba: Float[Tensor, "h w 4"]) -> Float[Tensor, "_ _ 3"]:
-    """Reduce a photograph in size and dim its background."""
+    """Return a photograph at reduced size with its background dimmed."""
     pixels = rgba.movedim(-1, 0)[None]
     pixels = avg_pool2d(pixels, max(1, round(max(pixels.shape[2:]) / PHOTOGRAPH)))[0].movedim(0, -1)
     return pixels[..., :3] * (DIMMED + (1.0 - DIMMED) * pixels[..., 3:])

@@ -65,7 +65,7 @@ class BoxTask(Task):
     def _chosen(self, context: Context) -> tuple[Photos, str]:
         photos = context.experiment.imaging.objects
         if not isinstance(photos, Photos):
-            raise UserError("stages=[box] sets boxes about photographed objects: want objects=photos")
+            raise UserError("stages=[box] sets the box around a photographed object: want objects=photos")
         names = photos.names()
         name = names[0] if self.object is None and len(names) == 1 else self.object
         if name not in names:

@@ -43,7 +43,7 @@ class Task(ABC):
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
         """Return the stages whose results the task will read, as far as they are known before it runs.
 
-        Called, and the stages checked, before any task runs, so that bad settings are refused at the start.
+        This is called, and the stages are checked, before any task runs, so that bad settings are refused at the start.
 
         Raises:
             ValueError: the task cannot work with the settings of the run.
@@ -64,10 +64,10 @@ class Context:
         folder: output folder of tasks.
         build: builds the experiment on first use; studies of finished runs need none.
         stages: names of the stages and tasks that the command asks for.
-        account: time spent and work left out, for the report.
+        account: the time spent and the work left out, for the report.
         live: the command's MLflow run while it is open.
         of_method: builds the experiment of the same command with another method (``baseline=...``); None if the
-            program cannot compose it.
+            caller cannot compose it.
         begun: start of the current task, in seconds since 1970.
         logged: seconds per phase that are in the log already.
         command: command line as typed, on one line.
@@ -120,7 +120,7 @@ class Context:
             self.live.iteration(dataclasses.asdict(record))
 
     def together(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
-        """Make those of the stages that the store lacks in parallel, with the workers of the run."""
+        """Make the stages that the store lacks in parallel, with the run's workers, and return all of them."""
         wanted, run = list(stages), self.experiment.run
         if wanted:
             with self.account.charged(wanted[0].phase):
@@ -133,7 +133,7 @@ class Context:
 
     @contextmanager
     def running(self, name: str) -> Iterator[None]:
-        """Charge a task for its time, except for phases whose results it reads, and log the time of new phases."""
+        """Charge a task for its time, excluding the phases whose results it reads, and log the time of new phases."""
         self.begun = time.time()
         with self.account.charged(name):
             try:
@@ -142,8 +142,8 @@ class Context:
                 if error.filename is not None:
                     raise
                 # Errors of a full or missing disk carry no path.
-                why, kept = error.strerror or error, "what was finished before is kept"
-                raise UserError(f"{name}: writing to {self.folder}: {why}; {kept}") from error
+                why, kept = error.strerror or error, "finished results are kept"
+                raise UserError(f"{name}: {self.folder} cannot be written to: {why}; {kept}") from error
         for phase, spent in self.account.seconds.items():
             if phase not in self.logged:
                 _log.info("%-11s %8.1f s", phase, spent)
@@ -153,7 +153,7 @@ class Context:
 
     @contextmanager
     def tracked(self) -> Iterator[None]:
-        """Keep an MLflow run open meanwhile, if the report is asked for."""
+        """Keep an MLflow run open inside this context if the command asks for the report."""
         if "report" not in self.stages:
             with nullcontext():
                 yield
@@ -184,7 +184,8 @@ class Context:
             document: content of ``<name>.json``; numbers that are not finite become null.
             text: content of ``<name>.md``, which is printed as well; None: no such file.
             figures: figures by name, written to ``figures/<name>.png``.
-            metrics: final numbers, or sequences with one value per step; None and values not finite are left out.
+            metrics: final numbers, or sequences with one value per step; None and values that are not finite are left
+                out.
             tags: further tags of the MLflow run, in addition to the seed.
             title: title of the MLflow run; None: its seed.
 
@@ -211,6 +212,6 @@ class Context:
                 run.log_series(series)
                 run.log_files(self.folder)
         except ValueError as error:  # only a warning, since the folder has the results
-            _log.warning("%s; MLflow has no run of this", error)
+            _log.warning("%s; these results are not in MLflow", error)
         print(f"results: {self.folder}" + (f"\n{run.where}" if run else ""))
         return run

@@ -53,8 +53,8 @@ class DoctorTask(Task):
     """Checks of packages, device, memory, OpenGL, store, database and data; the exit status is 1 if one is bad.
 
     Args:
-        memory_gb: note less free memory than this; a run at ``scale=quick`` takes 2 to 3 GB.
-        disk_gb: note less free space than this on the disk of the store.
+        memory_gb: free memory below which there is a note; a run at ``scale=quick`` takes 2 to 3 GB.
+        disk_gb: free space on the disk of the store below which there is a note.
     """
 
     memory_gb: PositiveInt = 4
@@ -74,7 +74,7 @@ class DoctorTask(Task):
             raise TaskFailure(f"doctor: {', '.join(bad)}")
 
     def findings(self, context: Context) -> Iterator[Finding]:
-        """Run one check after another; a check that raises counts as bad."""
+        """Yield the findings of all checks, in order; a check that raises is a bad finding."""
         paths, accelerator = context.config["paths"], context.config["trainer"]["accelerator"]
         store = Path(paths["store"]).expanduser()
         checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
@@ -95,20 +95,20 @@ class DoctorTask(Task):
     def _memory(self) -> Iterator[Finding]:
         free = _free_memory_gb()
         if free is None:
-            yield Finding("note", "memory", "this system does not tell how much is free")
+            yield Finding("note", "memory", "this system does not say how much is free")
         else:
             low = free < self.memory_gb
-            advice = "close other programs, or take scale=smoke" if low else ""
+            advice = "close other programs, or use scale=smoke" if low else ""
             yield Finding("note" if low else "ok", "memory", f"{free:.1f} GB free", advice)
 
     def _store(self, root: Path) -> Iterator[Finding]:
         folder = next(path for path in (root, *root.absolute().parents) if path.exists())
         if not folder.is_dir():
-            yield Finding("bad", "store", f"{folder} is a file", "name a folder by paths.store")
+            yield Finding("bad", "store", f"{folder} is a file", "set paths.store to a folder")
             return
         if not os.access(folder, os.W_OK | os.X_OK):
             yield Finding(
-                "bad", "store", f"{folder} cannot be written", "mend its permissions, or set paths.store"
+                "bad", "store", f"{folder} cannot be written to", "change its permissions, or set paths.store"
             )
             return
         free = shutil.disk_usage(folder).free / 2**30
@@ -122,18 +122,18 @@ class DoctorTask(Task):
             names = ", ".join(str(path) for path in audit.damaged[:3])
             yield Finding(
                 "bad", "results in the store", f"{len(audit.damaged)} are damaged or of an older version: {names}",
-                "the next run that needs one makes it again; check the disk if they are new",
+                "the next run that needs one makes it again; if they are recent, check the disk",
             )  # fmt: skip
         if audit.checkpoints:
             size = sum(path.stat().st_size for path in audit.checkpoints) / 2**20
             yield Finding(
                 "note", "checkpoints in the store", f"{len(audit.checkpoints)} of unfinished work, {size:.0f} MB",
-                "the same command goes on from them; delete *.checkpoint of what is not wanted any more",
+                "the same command resumes from them; delete the *.checkpoint files of work that you no longer want",
             )  # fmt: skip
         if audit.left:
             yield Finding(
-                "note", "results in the store", f"{len(audit.left)} files of killed runs or set aside as damaged",
-                "the next run removes what is half written; delete *.damaged",
+                "note", "results in the store", f"{len(audit.left)} files left by killed runs or set aside as damaged",
+                "later runs remove half-written files; delete *.damaged",
             )  # fmt: skip
 
 
@@ -155,7 +155,10 @@ def packages() -> Iterator[Finding]:
     ours = f"neural-sim {neural_sim.__version__}, Python {platform.python_version()}"
     advice = "pip install -r requirements.lock" if wrong else ""
     yield Finding(
-        "bad" if wrong else "ok", "packages", "; ".join(wrong) or f"{ours}, {len(versions)} as wanted", advice
+        "bad" if wrong else "ok",
+        "packages",
+        "; ".join(wrong) or f"{ours}, {len(versions)} required packages",
+        advice,
     )
     if _is_installed("pyrender"):
         yield Finding(
@@ -173,14 +176,14 @@ def devices(accelerator: str) -> Iterator[Finding]:
     """Check the device that runs would use, the cores and the torch threads."""
     device = device_of(accelerator)
     if device.type == "cpu" and torch.cuda.is_available():
-        yield Finding("note", "device", "a GPU answers here, and runs use the CPU", "trainer=gpu")
+        yield Finding("note", "device", "this machine has a GPU, but runs use the CPU", "trainer=gpu")
     else:
         held = gpu(device)
         name = f"{held['device']}, {held['gpu_mb'] / 1024:.0f} GB" if "gpu_mb" in held else device.type
         yield Finding("ok", "device", name)
     cores, threads = len(os.sched_getaffinity(0)), torch.get_num_threads()
     advice = f"OMP_NUM_THREADS={cores}" if threads > cores else ""
-    yield Finding("note" if advice else "ok", "cores", f"{cores} cores, {threads} threads of torch", advice)
+    yield Finding("note" if advice else "ok", "cores", f"{cores} cores, {threads} torch threads", advice)
 
 
 def opengl() -> Iterator[Finding]:
@@ -188,11 +191,11 @@ def opengl() -> Iterator[Finding]:
     backend = opengl_platform()
     if backend is None:
         yield Finding(
-            "note", "OpenGL", "neither EGL nor OSMesa draws: meshes are drawn by ray casting, more slowly",
+            "note", "OpenGL", "neither EGL nor OSMesa works: meshes are drawn by ray casting, which is slower",
             "apt install libegl1 libgl1-mesa-dri, or libosmesa6",
         )  # fmt: skip
     else:
-        yield Finding("ok", "OpenGL", f"draws over {backend}")
+        yield Finding("ok", "OpenGL", f"draws with {backend}")
 
 
 def database(uri: str) -> Iterator[Finding]:
@@ -204,12 +207,14 @@ def database(uri: str) -> Iterator[Finding]:
             count = len(client.search_experiments())
     except Exception as error:  # from MLflow, the database driver or the network
         yield Finding(
-            "bad", "MLflow", f"{uri}: {first_line(error)}", "mend it, move it away, or set paths.mlflow"
+            "bad", "MLflow", f"{uri}: {first_line(error)}", "repair it, move it away, or set paths.mlflow"
         )
         return
     yield Finding("ok", "MLflow", f"{uri}: {count} experiments")
     if closed:
-        yield Finding("note", "MLflow", f"{len(closed)} runs of processes that are gone are now KILLED")
+        yield Finding(
+            "note", "MLflow", f"{len(closed)} runs of processes that have ended are now marked KILLED"
+        )
 
 
 def data(root: Path) -> Iterator[Finding]:
@@ -219,7 +224,7 @@ def data(root: Path) -> Iterator[Finding]:
     if found:
         yield Finding("ok", "data", f"{root}: {', '.join(found)}")
     else:
-        advice = "only experiments on scans and photographs need it: paths.data or NEURAL_SIM_DATA"
+        advice = "only experiments on scans and photographs need data: set paths.data or NEURAL_SIM_DATA"
         yield Finding("note", "data", f"{root} has none of {', '.join(known)}", advice)
 
 

@@ -1,4 +1,4 @@
-"""Task ``export``: write a data set of annotated images drawn from a distribution, of any size."""
+"""Task ``export``: write a data set of annotated images of any size, drawn from a distribution."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class ExportTask(Task):
             uses the run's fields.
         largest_views: largest side, in pixels, of the views for ``detail=auto``.
         scene_size: images per BOP scene.
-        workers: number of processes; 0: this process alone; null: the cluster if the run has one, this process alone
-            on a GPU, else one process per core.
+        workers: number of processes; 0: this process alone; null: this process alone on a GPU, and on a CPU the cluster
+            if the run has one, else one process per core.
 
     Raises:
         ValueError: only one of width and height is given.
@@ -193,7 +193,7 @@ class ExportTask(Task):
         return self.workers
 
     def _look(self, renderer: NerfRenderer, synthesizer: Synthesizer) -> dict[str, Any]:
-        """Return the settings that decide how images are rendered, composed and written, for their identity."""
+        """Return the part of the identity that says how images are rendered, composed and written."""
         described = {"renderer": describe(renderer), "synthesis": describe(synthesizer)}
         return {
             **described,
@@ -217,15 +217,15 @@ def _take_up(left: Path, data: DataSet) -> None:
             if ours:
                 ExportFolder(left, data.identity).check()
                 shutil.move(left, data.root)
-                _log.info("export: goes on with what a run that was ended left in %s", left)
+                _log.info("export: continues the unfinished data set of %s", left)
     except (OSError, ValueError) as error:
-        _log.warning("export: begins anew; %s is left as it is (%s)", left, error)
+        _log.warning("export: starts again; %s is left as it is (%s)", left, error)
 
 
 def _rounded_probabilities(
     distribution: SceneDistribution, psi: Float[Tensor, "objects K"], names: Sequence[str]
 ) -> dict[str, dict[str, list[float]]]:
-    """Return the probabilities of every object, by factor."""
+    """Return the probabilities of every object by factor, rounded to 12 digits."""
     p = distribution.probabilities(psi.double())
     return {
         name: {factor: [round(v, 12) for v in p[factor][label].tolist()] for factor in p}
@@ -236,13 +236,13 @@ def _rounded_probabilities(
 def models_of(objects: Objects) -> list[Model]:
     """Return the objects in millimetres, in the frames of their meshes or, if photographed, in their normalised frame.
 
-    If the size of any object is unknown, all radii are taken to be 100 mm, with a message in the log.
+    If the size of any object is unknown, all radii are taken to be 100 mm, with a warning.
     """
     radii, made = objects.radii, []
     unknown = [name for name, radius in radii.items() if radius is None]
     if unknown:
         _log.warning(
-            "export: nothing says the size of %s; a radius counts as %g mm in poses and depth",
+            "export: the size of %s is unknown; the radius of every object counts as %g mm in poses and depth",
             ", ".join(unknown), UNKNOWN_RADIUS,
         )  # fmt: skip
     for name in objects.names:

@@ -94,7 +94,7 @@ class PredictTask(Task):
             write_json(folder / "scores.json", document, indent=None)
             print(scores_table(ap, len(scored)))
             if (why := worthless(ap, [found for found, _ in scored])) is not None:
-                _log.warning("predict: the score: %s", why)
+                _log.warning("predict: the score says nothing: %s", why)
         print(f"{len(rows)} detections in {len(entries)} pictures\nresults: {folder}")
 
     def _saved(self, context: Context) -> SavedDetector:

@@ -1,4 +1,4 @@
-"""Task ``preflight``: tell whether an optimisation is worth running, and how else renders differ from the target."""
+"""Task ``preflight``: estimate whether an optimisation is worth running, and compare renders with the target."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PreflightTask(Task):
     object and bin to first order, and how renders differ from the target.
 
     Args:
-        trials: trainings whose derivatives are averaged.
+        trials: number of trainings whose derivatives are averaged.
         moved: fraction of an object's images that is moved to a bin to estimate the gain of that bin.
         labelled: numbers of labelled training photographs whose gain is measured for comparison, if the target has any
             to train on.
@@ -46,7 +46,7 @@ class PreflightTask(Task):
         method, graph = context.experiment.loop.method, context.graph
         if not isinstance(method, (HypergradientLoop, Response)):
             raise ValueError(
-                f"preflight wants a method that follows the hypergradient, got baseline={method.name}"
+                f"preflight wants a method that follows the hypergradient or the response, got baseline={method.name}"
             )
         return [graph.targets, graph.shown, graph.warm_start, graph.of_initial]
 

@@ -37,7 +37,8 @@ class RepeatTask(Task):
     """Detectors of the initial, the learned and the target distribution, each trained several times.
 
     The first training is the run's own. The target distribution is left out if it is unknown or if the run starts from
-    it. Fields, psi and test images do not change. If a subset of photographs trains too, each training chooses its own.
+    it. Fields, psi and test images do not change. If training uses a subset of photographs, each training chooses its
+    own.
 
     Args:
         trainings: number of trainings on each distribution.
@@ -101,8 +102,8 @@ def table(found: Sequence[ScoreTable], score: Score) -> str:
         "",
         *(CALLED[detector] for detector in which),
         *(f"{CALLED[a]} minus {CALLED[b]}" for a, b in differences),
-        "one training's scatter",
-        "over images",
+        "between trainings",
+        "over test images",
     ]
     rows = []
     for scores in found:
@@ -118,8 +119,9 @@ def table(found: Sequence[ScoreTable], score: Score) -> str:
         )
     note = (
         f"{score[0].upper()}{score[1:]} on the test set in points, means of {found[0].point.shape[1]} trainings, with "
-        "95 % intervals over trainings and test images. Differences in bold leave 0 out. The last two columns are "
-        "standard deviations of one detector's score: between trainings on one distribution, and over test images."
+        "95 % intervals over trainings and test images. Differences whose interval excludes 0 are bold. The last two "
+        "columns are standard deviations of one detector's score: between trainings on one distribution, and over test "
+        "images."
     )
     return f"{markdown_table(head, rows)}\n\n{note}"
 
@@ -149,4 +151,4 @@ def _seeded(stage: TrainedStage, by: int) -> TrainedStage:
         return replace(stage, seed=stage.seed + by, start=start)
     if isinstance(stage, DetectorStage):
         return replace(stage, seed=stage.seed + by)
-    raise TypeError(f"repeat: a training that has no seed, {type(stage).__name__}")
+    raise TypeError(f"repeat: {type(stage).__name__} has no seed")

@@ -27,7 +27,7 @@ class ViewerTask(Task):
     """A page on localhost that stays open until Ctrl-C. Fields and the detector are read from the store, or computed.
 
     Args:
-        psi: distribution that is shown first and that the detector was trained on: ``initial``, ``target``, ``learned``
+        psi: distribution that is shown first and that the detector is trained on: ``initial``, ``target``, ``learned``
             (by a run of the same configuration), or a file: a run's folder, its ``results.json``, or an export's
             ``psi.json``.
         port: port of the page; if it is taken, the next free one.

@@ -160,9 +160,9 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
 
 
 def forecast(context: Context, phases: Collection[str]) -> str:
-    """Say how long phases took in the last run of this name, scale and method; empty if there is none.
+    """Return how long the phases took in the last run of this name, scale and method; empty if there is none.
 
-    Results that this run found in the store count with the time that they took to compute.
+    Results that the earlier run found in the store count with the time that they took to compute.
     """
     files = sorted(context.folder.parent.glob("*/results.json"), key=lambda path: -path.stat().st_mtime)
     alike = {"scale": context.scale, "method": context.experiment.loop.method.name}
@@ -183,7 +183,7 @@ def forecast(context: Context, phases: Collection[str]) -> str:
 
 
 def warn_of_uncovered(graph: Graph) -> None:
-    """Warn of bins without a photograph nearby: a field shows debris where no photograph looked."""
+    """Warn about bins without photographs nearby: a field may show debris from directions that no photograph shows."""
     distribution = graph.experiment.imaging.distribution
     for name, factors in graph.experiment.imaging.coverage.items():
         for factor, found in factors.items():
@@ -211,13 +211,13 @@ def omitted(graph: Graph, learns: bool) -> list[Omission]:
     loops, follows = not isinstance(method, (Fixed, LabelShift)), isinstance(method, HypergradientLoop)
     fixed = 0.0 if outer.learned is None else 1.0 - len(outer.learned) / len(graph.names)
     rows = [
-        (not distribution.lights, "field", "appearance codes", "no parameter moves the light", None),
+        (not distribution.lights, "field", "appearance codes", "no parameter changes the light", None),
         (isinstance(method, Fixed), "psi", "the psi loop", f"baseline={method.name} keeps its distribution", 1.0),
-        (isinstance(method, LabelShift), "warm_start", "the warm start", f"baseline={method.name} does without", 1.0),
+        (isinstance(method, LabelShift), "warm_start", "the warm start", f"baseline={method.name} uses none", 1.0),
         (isinstance(method, LabelShift), "psi", "the psi loop", f"baseline={method.name} trains no detector", 1.0),
         (loops and not follows, "psi", "hypergradients", f"baseline={method.name} compares trainings only", 1.0),
         (follows and isinstance(draws, HardDraws), "psi", "the renderer's derivative",
-         "the estimator scores images and differentiates none", 1.0),
+         "the estimator scores images and does not differentiate them", 1.0),
         (follows and fixed > 0.0, "psi", "probes", "outer.learned fixes the other objects' psi", fixed),
         (loops and pooled(outer, draws, distribution), "psi", "most renders of the loop",
          "fields do not change: every bin is rendered once", None),
