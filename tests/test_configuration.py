@@ -49,7 +49,7 @@ def test_what_is_gone_is_refused_in_one_line_that_says_what_to_take(word):
     ],
 )
 def test_what_has_moved_is_translated_and_said(word, today):
-    assert updated(["-m", word], {}, MOVES) == (["-m", today], [f"{word} is {today} now"])
+    assert updated(["-m", word], {}, MOVES) == (["-m", today], [f"{word} is now {today}"])
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from mlflow import MlflowClient
 
 ROOT = Path(__file__).parents[1]
-LINE = "neural-sim: ended by {}; the same command goes on with the results that are in the store"
+LINE = "neural-sim: ended by {}; the same command resumes from the results in the store"
 SIGNALS = ((signal.SIGTERM, 143), (signal.SIGINT, 130))
 PROGRAM = """
 import hashlib, os, signal, time

@@ -86,7 +86,7 @@ def test_floats_are_scaled_or_refused_by_their_values(tmp_path):
             read_picture(path)
 
 
-@pytest.mark.parametrize(("mode", "said"), [("I", r"32 bits \(mode I\)"), ("LAB", "mode LAB")])
+@pytest.mark.parametrize(("mode", "said"), [("I", r"32-bit integers \(mode I\)"), ("LAB", "mode LAB")])
 def test_modes_without_a_known_white_are_refused_by_their_headers(tmp_path, mode, said):
     path = saved(tmp_path / "a.tif", Image.new(mode, (8, 6)))
     for read in (read_picture, lambda path: check_headers([path], "key")):
@@ -337,7 +337,9 @@ def test_pictures_of_other_formats_are_left_out_with_a_count(tmp_path, caplog):
     for name in ("b.HEIC", "c.gif", "._d.heic"):
         (tmp_path / name).write_bytes(b"?")
     assert [path.name for path in picture_files(tmp_path)] == ["a.jfif"]
-    assert f"{tmp_path}: 2 files such as b.HEIC are of a format that is not read, and left out" in caplog.text
+    assert (
+        f"{tmp_path}: 2 files such as b.HEIC have a format that is not read, and are left out" in caplog.text
+    )
 
 
 def shades(*values, dtype=np.uint8):

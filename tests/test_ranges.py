@@ -75,11 +75,11 @@ CASES = {
     "inside a tuple": ({"interval": (-1.0, 1.0)}, "interval[0]: want at least 0, got -1.0"),
     "one value of two": ({"interval": [1.0]}, "interval: want a list of 2 values, got [1.0]"),
     "no list": ({"interval": 1.0}, "interval: want a list of numbers, got 1.0"),
-    "text is no list": ({"names": "can"}, "names: want a list of texts or null, got 'can'"),
-    "empty": ({"names": []}, "names: want 1 or more values and no value twice or null, got []"),
+    "text is no list": ({"names": "can"}, "names: want a list of strings or null, got 'can'"),
+    "empty": ({"names": []}, "names: want 1 or more values and no repeated value or null, got []"),
     "twice": (
         {"names": ["a", "a"]},
-        "names: want 1 or more values and no value twice or null, got ['a', 'a']",
+        "names: want 1 or more values and no repeated value or null, got ['a', 'a']",
     ),
     "in lists of lists": ({"sizes": [[1], [2, 0]]}, "sizes[1][1]: want more than 0, got 0"),
     "key of a dictionary": (
@@ -95,7 +95,7 @@ CASES = {
         "biased.can.initial: want uniform or a list of numbers, got 'unifrom'",
     ),
     "no mapping": ({"biased": ["can"]}, "biased: want a mapping or null, got ['can']"),
-    "no object": ({"inner": 3}, "inner: want a group with a _target_, such as of a Inner or null, got 3"),
+    "no object": ({"inner": 3}, "inner: want a group with a _target_, such as Inner or null, got 3"),
     "interval": ({"patch": 72}, "patch: want at least 8 and at most 64 and a multiple of 8, got 72"),
     "multiple": ({"patch": 9}, "patch: want at least 8 and at most 64 and a multiple of 8, got 9"),
     "test": ({"odd": 2}, "odd: want an odd number, got 2"),
@@ -151,7 +151,7 @@ def test_lazily_built_objects_are_checked_by_their_signature():
     check({**node, "bins": 2, "other": 0.5}, Any, "detector")
     with pytest.raises(UserError, match=r"^Plain\.bins: want at least 2, got 1$"):
         Plain(1)
-    with pytest.raises(UserError, match=r"^Plain\.mode: want text, got 3$"):
+    with pytest.raises(UserError, match=r"^Plain\.mode: want a string, got 3$"):
         Plain(2, mode=3)
 
 

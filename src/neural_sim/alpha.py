@@ -8,11 +8,11 @@ from torch import Tensor
 
 
 def premultiplied(rgba: Float[Tensor, "*pixels 4"]) -> Float[Tensor, "*pixels 4"]:
-    """RGBA with straight alpha, as views have, to colour times alpha, as renders have and as means want it."""
+    """Multiply the colours of straight RGBA, as views have it, by alpha, as renders have it and averaging needs it."""
     alpha = rgba[..., 3:]
     return torch.cat([rgba[..., :3] * alpha, alpha], -1)
 
 
 def over_white(image: Float[Tensor, "*pixels 4"]) -> Float[Tensor, "*pixels 3"]:
-    """Premultiplied RGBA over a white background."""
+    """Composite premultiplied RGBA over a white background."""
     return image[..., :3] + (1.0 - image[..., 3:])

@@ -21,8 +21,8 @@ def orbit(
     The object stands upright along world +z. ``phi`` goes once round the great circle through the poles: 0 above,
     pi/2 beside (world +x), pi below, 3 pi/2 on the other side (world -x). ``rho`` turns that circle about the
     vertical axis. Angles are in radians, positions in object radii; ``distance`` has the unit of ``radius``, the
-    object's radius (by default, object radii). The up vector is the derivative of the position by -phi, so nothing is
-    singular at the poles, where a ``look_at`` with world up is.
+    object's radius (by default, object radii). The up vector is minus the derivative of the direction with respect to
+    phi, so nothing is singular at the poles, unlike a ``look_at`` with world up.
     """
     sin_phi, cos_phi, sin_rho, cos_rho = phi.sin(), phi.cos(), rho.sin(), rho.cos()
     backward = torch.stack([sin_phi * cos_rho, sin_phi * sin_rho, cos_phi], -1)
@@ -40,7 +40,7 @@ def focal_length(camera: PinholeCamera) -> float:
 
 
 def focal_lengths(camera: PinholeCamera) -> tuple[float, float]:
-    """Compute the horizontal and vertical focal length in pixels."""
+    """Compute the horizontal and vertical focal lengths in pixels."""
     vertical = focal_length(camera)
     return camera.aspect * vertical, vertical
 
@@ -58,7 +58,7 @@ def opencv_camera(
     OpenCV's origin is the centre of the upper left pixel: ``cx`` of a centred camera is (width - 1) / 2, the default.
 
     Raises:
-        ValueError: sizes or focal lengths that are not positive and finite.
+        ValueError: a size or focal length is not positive and finite.
     """
     if not (0.0 < fx < math.inf and 0.0 < fy < math.inf):
         raise ValueError(f"camera: fx and fy must be positive and finite, got {fx} and {fy}")
@@ -69,7 +69,7 @@ def opencv_camera(
 
 
 def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
-    """Make the camera of this one's images resized to another width and height."""
+    """Make the camera that takes this camera's images, resized to another width and height."""
     x, y = principal_point(camera)
     (fx, fy), across, down = focal_lengths(camera), width / camera.width, height / camera.height
     centre = None if camera.centre is None else (across * x, down * y)
@@ -78,9 +78,9 @@ def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 
 def reframed(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
-    """Make the camera of images of another size that show all that this one's do, centred, in the same proportions.
+    """Make the camera of images of another size that contain this camera's whole image, centred and undistorted.
 
-    In their direction of more room they show more.
+    If the aspect ratios differ, the new images show more along one of their sides.
     """
     scale = min(width / camera.width, height / camera.height)
     fy = scale * focal_length(camera)
@@ -91,7 +91,7 @@ def reframed(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 
 def cropped(camera: PinholeCamera, left: int, top: int, width: int, height: int) -> PinholeCamera:
-    """Make the camera of a part of this one's images, which may reach beyond them; ``left``, ``top`` in pixels."""
+    """Make the camera of a crop of this camera's images, which may reach beyond them; ``left``, ``top`` in pixels."""
     x, y = principal_point(camera)
     angle = 2.0 * math.atan(0.5 * height / focal_length(camera))
     return PinholeCamera(width, height, angle, camera.aspect, (x - left, y - top))
@@ -100,16 +100,15 @@ def cropped(camera: PinholeCamera, left: int, top: int, width: int, height: int)
 def turned(
     camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], shift: tuple[float, float]
 ) -> Float[Tensor, "4 4"]:
-    """Turn a pose about its own place, so that what projected to the principal point does so ``shift`` pixels off.
+    """Rotate a camera in place, so that what it shows at the principal point moves by ``shift`` pixels (right, down).
 
-    ``shift`` is (right, down); the turn is the smallest that does it. The direction from the object to the camera
-    stays.
+    The rotation is the smallest that does so. The direction from the object to the camera does not change.
     """
     fx, fy = focal_lengths(camera)
     ahead = camera_to_world.new_tensor([0.0, 0.0, -1.0])
     aim = camera_to_world.new_tensor([shift[0] / fx, -shift[1] / fy, -1.0])
     aim = aim / cast(Tensor, aim.norm())  # pyright: ignore[reportUnknownMemberType]
-    # Rodrigues' formula for the turn of ``ahead`` onto ``aim``, whose axis is their cross product.
+    # Rodrigues' formula for the rotation of ``ahead`` onto ``aim``, whose axis is their cross product.
     axis, cosine = torch.cross(ahead, aim, dim=-1), ahead @ aim
     x, y, z = axis.unbind()
     zero = torch.zeros_like(x)
@@ -130,9 +129,9 @@ def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
 def cameras_of(
     camera: PinholeCamera, magnification: Float[Tensor, "n"] | None
 ) -> list[tuple[PinholeCamera, slice]]:
-    """List cameras and the images of each: one camera for all images, or one for each focal length.
+    """List cameras, each with its images: one for all images, or with ``magnification`` one for each image.
 
-    ``magnification`` are the focal lengths in units of the camera's.
+    ``magnification`` are the images' focal lengths in units of the camera's.
     """
     if magnification is None or len(magnification) == 0:
         return [(camera, slice(None))]
@@ -148,9 +147,9 @@ def pixel_rays(
 ) -> Rays:
     """Cast rays (*m, rays, 3) through the pixels' centres; ``pixel`` are flat indices into [views, height, width].
 
-    Row 0 is the top of the image. Rays are linear in the poses and differentiable by ``magnification``, the views'
-    focal lengths in units of the camera's. All callers share this arithmetic: a rounding error that moves a sample to
-    another cell changes its derivative.
+    Row 0 is the top of the image. Rays are linear in the poses and differentiable with respect to ``magnification``,
+    the views' focal lengths in units of the camera's. All callers share this arithmetic: a rounding error that moves a
+    sample to another cell changes its derivative.
     """
     per_view, (fx, fy), (cx, cy) = (
         camera.height * camera.width,
@@ -170,7 +169,7 @@ def pixel_rays(
 
 
 def rays(camera: PinholeCamera, camera_to_world: Float[Tensor, "*n 4 4"]) -> Rays:
-    """Cast rays through every pixel centre: shapes (*n, height, width, 3), differentiable in the pose."""
+    """Cast rays through every pixel centre: shapes (*n, height, width, 3), differentiable with respect to the pose."""
     poses = camera_to_world.reshape(-1, 4, 4)
     count = len(poses) * camera.height * camera.width
     bundle = pixel_rays(camera, poses, torch.arange(count, device=poses.device))
@@ -181,10 +180,10 @@ def rays(camera: PinholeCamera, camera_to_world: Float[Tensor, "*n 4 4"]) -> Ray
 def ray_rates(
     camera: PinholeCamera, rays: Rays, rates: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
 ) -> Rays:
-    """Differentiate these pixels' rays (*m, rays, 3), for derivatives ``rates`` of the camera-to-world matrices.
+    """Differentiate the rays (*m, rays, 3) of pixels, given the derivatives ``rates`` of the camera-to-world matrices.
 
-    Directions stay of unit length: the component along them is removed (for a rotating camera it is rounding error, for
-    a changing focal length the derivative of the normalisation).
+    Directions keep unit length, so the component along them is removed: for a rotating camera it is a rounding error,
+    for a changing focal length the derivative of the normalisation.
     """
     moved = pixel_rays(camera, rates, pixel)
     along = (moved.directions * rays.directions).sum(-1, keepdim=True)
@@ -196,7 +195,7 @@ def unit_sphere_span(
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
     """Find the distances along unit-length rays at which they enter and leave the sphere about the origin.
 
-    Entry >= exit where a ray misses it; entry is 0 for an origin inside.
+    Entry >= exit if the ray misses the sphere; entry is 0 if the origin lies inside.
     """
     along = -(bundle.origins * bundle.directions).sum(-1)
     closest = bundle.origins + along[..., None] * bundle.directions

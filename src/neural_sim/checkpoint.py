@@ -7,16 +7,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 State = Mapping[str, Any]
-"""Tensors on the CPU, numbers, strings, lists, tuples and mappings of these, dataclasses that the reader knows."""
+"""Tensors on the CPU, numbers, strings, dataclasses that the reader knows, and lists, tuples and mappings of these."""
 
 
 class Checkpoint:
     """The state of one piece of work.
 
     Args:
-        read: returns the state that was written last, None without one.
-        write: writes a state in its place.
-        every: seconds from one writing to the next, at least.
+        read: returns the state that was written last, None if there is none.
+        write: writes a state that replaces the last one.
+        every: smallest number of seconds between two writes.
     """
 
     def __init__(
@@ -26,7 +26,10 @@ class Checkpoint:
         self._written = time.monotonic()
 
     def offer(self, state: Callable[[], State | None]) -> None:
-        """Write what ``state`` returns if it is time to; None: the work is where it cannot be taken up, ask again."""
+        """Write what ``state`` returns, if enough time has passed since the last write.
+
+        It returns None while the work cannot be resumed from where it is; the next call tries again.
+        """
         if time.monotonic() - self._written < self._every:
             return
         if (now := state()) is not None:

@@ -1,4 +1,4 @@
-"""Check the words of a command line against the groups, choices and keys of ``conf/``, and explain slips."""
+"""Check the words of a command line against the groups, choices and keys of ``conf/``, and explain mistakes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neural_sim.configuration import UserError, first_line
 from neural_sim.extras import require
 
 OWN_WORDS = ("--config-name", "-cn", "--config-path", "-cp", "--shell-completion", "-sc", "--hydra-help")
-"""Flags with which the configuration is another, or the words are no settings: nothing is checked here."""
+"""Flags that select another configuration or make the words other than settings: with them nothing is checked here."""
 FOLDERS = ("--config-dir", "-cd")
 PATHS = {
     "objects.root": "a folder that holds a folder for each object",
@@ -28,7 +28,7 @@ PATHS = {
     "predict.images": "a picture, a folder or a pattern in quotes",
     "predict.annotations": "a COCO file",
 }
-"""Keys of what a user brings, and what it must be."""
+"""Keys whose values are paths of a user's own data, and what each path must be."""
 WITH_VALUE = (*FOLDERS, "--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun")
 
 
@@ -38,7 +38,7 @@ class Key:
 
     Attributes:
         value: its text in the file.
-        comment: that of its line, empty without one.
+        comment: the comment on its line; empty if there is none.
         choice: the file, as ``group=choice``; empty for ``config.yaml``.
     """
 
@@ -59,7 +59,7 @@ class Layout:
 
     @cached_property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """Choices by group, whose name has a slash where it lies in another: ``outer/steps``."""
+        """Choices by group; the name of a group inside another has a slash: ``outer/steps``."""
         found: dict[str, set[str]] = {}
         for folder in self.folders:
             for path in folder.rglob("*.yaml"):
@@ -70,19 +70,19 @@ class Layout:
 
     @property
     def launchers(self) -> set[str]:
-        """The ways to run a sweep's jobs that are no part of Hydra itself."""
+        """Names of the launchers of sweeps that are not part of Hydra itself."""
         return {path.stem for path in (self.folders[0] / "hydra" / "launcher").glob("*.yaml")}
 
     @cached_property
     def defaults(self) -> dict[str, Key]:
-        """The groups of the defaults list, with the choice that is made unless the command makes another."""
+        """The groups of the defaults list, with their default choices."""
         lines = (self.folders[0] / "config.yaml").read_text(encoding="utf-8").splitlines()
         found = (re.match(r"  - ([\w/]+): (\[?\w+\]?)\s*(?:# (.*))?$", line) for line in lines)
         return {row[1]: Key(row[2].strip("[]"), row[3] or "", "") for row in found if row}
 
     @cached_property
     def keys(self) -> dict[str, list[Key]]:
-        """Every dotted key of the files, with all places where it stands, ``config.yaml`` first."""
+        """Every dotted key of the files, with all its occurrences, those in ``config.yaml`` first."""
         found: dict[str, list[Key]] = {}
         files = [(self.folders[0] / "config.yaml", "", "")]
         for group, choices in self.groups.items():
@@ -102,7 +102,7 @@ class Layout:
 
     @cached_property
     def tasks(self) -> tuple[str, ...]:
-        """The nodes of ``config.yaml`` that ``stages`` may name, beside a run's phases."""
+        """The nodes of ``config.yaml`` that ``stages`` may name in addition to a run's phases."""
         text = (self.folders[0] / "config.yaml").read_text(encoding="utf-8")
         return tuple(re.findall(r"^(\w+):.*\n  _target_: neural_sim\.tasks\.", text, re.MULTILINE))
 
@@ -115,7 +115,7 @@ class Layout:
 
 
 def layout_of(words: Sequence[str], conf: Path) -> Layout | None:
-    """Find the files that a command reads; None where it brings a configuration of its own."""
+    """Find the files that a command reads; None if it selects another configuration or has no settings."""
     if any(word.partition("=")[0] in OWN_WORDS for word in words):
         return None
     following = zip(words, (*words[1:], ""), strict=False)
@@ -124,17 +124,17 @@ def layout_of(words: Sequence[str], conf: Path) -> Layout | None:
 
 
 def checked(words: Sequence[str], layout: Layout, commands: Iterable[str] = ()) -> None:
-    """Refuse what cannot be meant, before anything is composed.
+    """Refuse words that cannot be right, before the configuration is composed.
 
     Hydra proposes ``+detecter=fcos`` for ``detecter=fcos``, and then runs the default detector.
 
     Args:
-        words: of the command line.
-        layout: the files that it is checked against.
-        commands: that could stand at its beginning.
+        words: words of the command line.
+        layout: the files that they are checked against.
+        commands: commands that may come first.
 
     Raises:
-        UserError: a word that is no setting, an unknown group, choice or key of the top level.
+        UserError: a word is not a setting, or names an unknown group, choice or top-level key.
     """
     skipped = False
     for word in words:
@@ -160,10 +160,10 @@ def checked(words: Sequence[str], layout: Layout, commands: Iterable[str] = ()) 
 
 
 def present(words: Sequence[str]) -> None:
-    """Refuse paths that lead nowhere, before anything heavy is imported; patterns and sweeps are left alone.
+    """Refuse paths that do not exist, before anything heavy is imported; patterns and sweeps are not checked.
 
     Raises:
-        UserError: with what is wanted in the place of a path.
+        UserError: a path does not exist; the message says what the key wants.
     """
     for word in words:
         key, _, value = word.lstrip("+").partition("=")
@@ -199,7 +199,7 @@ def _no_setting(word: str, layout: Layout, commands: Iterable[str]) -> str:
     meant = _meant(word, {*commands, *layout.groups.get("experiment", ())})
     if meant and " " not in word:
         return f"{word}: no such command or experiment{meant}"
-    return f"{word}: want key=value, such as seed=1 (in quotes, where it has spaces), or --help"
+    return f"{word}: want key=value, such as seed=1 (in quotes if it has spaces), or --help"
 
 
 def _check_choice(word: str, group: str, value: str, layout: Layout) -> None:
@@ -207,7 +207,7 @@ def _check_choice(word: str, group: str, value: str, layout: Layout) -> None:
         raise UserError(f"{word}: want +{word}, because it has no default")
     if group in layout.defaults and word.startswith("+"):
         raise UserError(f"{word}: want {word.lstrip('+')}, because it has a default")
-    if "(" in value or "$" in value:  # sweeps of Hydra's own, interpolations
+    if "(" in value or "$" in value:  # Hydra's own sweep syntax, or an interpolation
         return
     for choice in (part.strip(" []'\"") for part in value.split(",")):
         if choice and choice != "null" and choice not in layout.groups[group]:
@@ -217,7 +217,7 @@ def _check_choice(word: str, group: str, value: str, layout: Layout) -> None:
 
 
 def worded(error: BaseException, layout: Layout | None) -> str:
-    """Word one of Hydra's errors of composition in a line that says what to type instead."""
+    """Return one of Hydra's composition errors as one line that says what to type instead."""
     missing = re.search(r"Could not (?:override|append to) '?([\w.]+)", str(error))
     if missing is not None and layout is not None:
         return explained(missing[1], layout)
@@ -228,12 +228,12 @@ def worded(error: BaseException, layout: Layout | None) -> str:
 
 
 def explained(key: str, layout: Layout) -> str:
-    """Say of a key that does not exist which one was meant, or which choices have it."""
+    """Return a message for a key that does not exist: which one may be meant, or which choices have it."""
     if key in layout.keys:
         having = sorted({at.choice for at in layout.keys[key] if at.choice})
         groups = [choice for choice in having if not choice.startswith("experiment=")]
         wanted = groups or [f"+{choice}" for choice in having][:5]
-        return f"{key}: the choices that were made have no such key; want {' or '.join(wanted)}"
+        return f"{key}: the chosen groups have no such key; want {' or '.join(wanted)}"
     parent, _, last = key.rpartition(".")
     beside = {other.rpartition(".")[2] for other in layout.keys if other.rpartition(".")[0] == parent}
     # The name may be right and the place wrong.
@@ -278,7 +278,7 @@ def _keys(text: str) -> Iterator[tuple[str, str, str]]:
 
 
 def _inline(value: str) -> Iterator[str]:
-    """Yield the keys of a mapping that is written in one line."""
+    """Yield the keys of a mapping that is written on one line."""
     if not value.startswith("{"):
         return
 

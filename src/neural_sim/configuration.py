@@ -1,4 +1,4 @@
-"""Find the configuration files, translate old keys, and word the errors in them."""
+"""Find the configuration files, name the folders of runs and sweeps, and translate old keys."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 
 class UserError(ValueError):
-    """Something in the configuration or the input that the user can mend."""
+    """An error in the configuration or the input that the user can correct."""
 
 
 def conf_directory() -> Path:
-    """Find the checkout's ``conf/``, or the copy that travels in the wheel.
+    """Find the checkout's ``conf/``, or the copy in the installed package.
 
     Raises:
         FileNotFoundError: neither exists.
@@ -21,17 +21,17 @@ def conf_directory() -> Path:
     for candidate in (here.parents[2] / "conf", here.parent / "conf"):
         if (candidate / "config.yaml").is_file():
             return candidate
-    raise FileNotFoundError(f"no conf/config.yaml beside {here.parents[2]} or in the installed package")
+    raise FileNotFoundError(f"no conf/config.yaml in {here.parents[2]} or in the installed package")
 
 
 LONGEST = 150
-"""Characters of the name of a job's folder; file systems allow 255 bytes."""
+"""Largest number of characters in the name of a job's folder; file systems allow 255 bytes."""
 
 
 def job_folder(number: int | str, overrides: str) -> str:
-    """Name the folder of a sweep's job by its number and its overrides, cut where they are long.
+    """Name the folder of a sweep's job by its number and its overrides, cut to ``LONGEST`` characters.
 
-    All of them are in ``.hydra/overrides.yaml`` of the folder.
+    The file ``.hydra/overrides.yaml`` in the folder lists all overrides.
     """
     return f"{number}_{overrides}".replace("/", "-")[:LONGEST]
 
@@ -46,7 +46,7 @@ def view_size(source: str | None, of_meshes: int, of_photographs: int) -> int:
 
 
 def own_folder(wanted: Path) -> Path:
-    """Make a new folder: ``wanted``, or where there is one already, ``wanted``_2, _3, ..."""
+    """Make a new folder: ``wanted`` or, if that exists, ``wanted``_2, _3, ..."""
     folder, number = wanted, 1
     while True:
         try:
@@ -59,10 +59,10 @@ def own_folder(wanted: Path) -> Path:
 
 GONE: dict[str, str] = {
     "baseline=none": "it meant Neural-Sim with its optimisation; want baseline=neural_sim, or baseline=ns for none",
-    "gradient.relaxation": "draws of gradient=pathwise are always Gumbel-softmax's; leave it out",
+    "gradient.relaxation": "gradient=pathwise always uses Gumbel-softmax draws; leave it out",
     "gradient.conditional_draws": "it was a setting of gradient.relaxation=gumbel_rao; leave it out",
-    "gradient.antithetic": "it lowered no error; for less noise want gradient=stratified",
-    "gradient.common_backgrounds": "it lowered no error; for less noise want gradient=stratified",
+    "gradient.antithetic": "it did not reduce errors; for less noise want gradient=stratified",
+    "gradient.common_backgrounds": "it did not reduce errors; for less noise want gradient=stratified",
     "solver=neumann": "want solver=cg, or solver=minres for indefinite systems",
     "solver=nystrom": "want solver=cg, or solver=minres for indefinite systems",
     "outer.update._target_=neural_sim.parameter.update.Adam": "want neural_sim.parameter.update.Mirror or SGD",
@@ -70,9 +70,9 @@ GONE: dict[str, str] = {
     "baseline=random_search": "want baseline=lts, which learns from the same rewards",
     "baseline=bayes_opt": "want baseline=lts, which learns from the same rewards",
     "gradient.theta_mode=reverse": "it gained nothing; want forward or central_difference, with gradient=stratified",
-    "outer.certify": "the reference is the response of training; outer.certify_every alone asks for it",
-    "outer.certify_per_bin": "it belonged to outer.certify=retrained, which is a reference of the tests now",
-    "baseline.max_step": "baseline=lts draws settings of psi now; want baseline.deviation or baseline.learning_rate",
+    "outer.certify": "the reference is always the response of training; want outer.certify_every alone",
+    "outer.certify_per_bin": "it belonged to outer.certify=retrained, which only the tests use now; leave it out",
+    "baseline.max_step": "baseline=lts draws psi now; want baseline.deviation or baseline.learning_rate",
     "synthesis.label_gradient": "derivatives of boxes gained nothing (docs/paper.md); boxes are fixed labels",
 }
 """The message for each key or choice (``key=value``) that no longer exists. A key stands for all keys below it, too."""
@@ -108,7 +108,7 @@ MOVED: dict[str, str] = {
     "outer.smooth_ap": "outer.objective",
     "outer.smooth_accuracy": "outer.objective",
 }
-"""Today's names of keys and choices (``key=value``) that have moved.
+"""Current names of keys and choices (``key=value``) that have moved.
 
 A key stands for all keys below it, too, unless it has become a group, whose name has a slash:
 ``"outer.trust": "outer.adjoint.trust"`` moves ``outer.trust.level``, while ``"outer.adjoint": "outer/adjoint"`` leaves
@@ -119,13 +119,13 @@ A key stands for all keys below it, too, unless it has become a group, whose nam
 def updated(
     words: Sequence[str], gone: Mapping[str, str] = GONE, moved: Mapping[str, str] = MOVED
 ) -> tuple[list[str], list[str]]:
-    """Translate the words of a command line to today's names.
+    """Translate the words of a command line to current names.
 
     Returns:
-        The words, those of moved keys and choices replaced, and a line for each that was.
+        The words, with moved keys and choices replaced, and one line for each replacement.
 
     Raises:
-        UserError: a key or choice that no longer exists.
+        UserError: a key or choice no longer exists.
     """
     current, notes = [], []
     for word in words:
@@ -141,16 +141,16 @@ def updated(
         renamed = _renamed(key, value, moved)
         if renamed is not None:
             name, translated = renamed
-            # Hydra takes a group that is in the defaults list without a prefix only.
+            # Hydra accepts a group of the defaults list only without a prefix.
             override = ("" if "/" in name else prefix) + name + equals + translated
-            notes.append(f"{word} is {override} now")
+            notes.append(f"{word} is now {override}")
             word = override
         current.append(word)
     return current, notes
 
 
 def _renamed(key: str, value: str, moved: Mapping[str, str]) -> tuple[str, str] | None:
-    """Today's key and value, of a sweep value by value; None for what has not moved."""
+    """Return the current key and value, or a sweep's values; None if nothing has moved."""
     words = [f"{key}={one}" for one in value.split(",")]
     choices = [moved.get(word, word).partition("=") for word in words]
     names = {name for name, _, _ in choices}
@@ -163,7 +163,7 @@ def _renamed(key: str, value: str, moved: Mapping[str, str]) -> tuple[str, str] 
 
 
 def _with_parents(key: str) -> list[str]:
-    """Yield a dotted key and the keys above it, the longest first."""
+    """Return a dotted key and the keys above it, the longest first."""
     parts = key.split(".")
     return [".".join(parts[:count]) for count in range(len(parts), 0, -1)]
 

@@ -1,7 +1,7 @@
-"""Where a run computes: the one place that names a torch device, and the trainers that run on it.
+"""Where a run computes: the one place that chooses a torch device, and the trainers that run on it.
 
 Draws and psi, few numbers each, are made on the CPU by CPU generators, so that a seed draws the same scenes on every
-device. Fields, images, features and targets live on the run's device; what leaves a stage comes back to the CPU once.
+device. Fields, images, features and targets live on the run's device; results of stages are stored from the CPU.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.profiler import ProfilerActivity, profile
 from typing_extensions import override
 
-# Read when the profiler first runs, which otherwise writes lines of its own to the screen.
+# Read when the profiler first runs, which otherwise prints lines of its own.
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")
-# A line on SIGTERM, which `interruption` has said already.
+# Silences a line on SIGTERM, which `interruption` reports itself.
 logging.getLogger("lightning.pytorch.trainer.connectors.signal_connector").setLevel(logging.WARNING)
 
 DEVICES = {"cpu": "cpu", "gpu": "cuda"}
 """torch's device type by ``trainer.accelerator``."""
 CACHES = 32
-"""How many times the work that fits a CPU's cache is handed to any other device at once."""
+"""Batches on a GPU are this many times as large as those that fit a CPU's cache."""
 
 
 def device_of(accelerator: str) -> torch.device:
     """Return the device of ``trainer.accelerator``, set to compute as the CPU does, in full float32.
 
     Raises:
-        ValueError: an unknown accelerator, or one this machine lacks.
+        ValueError: the accelerator is unknown, or this machine lacks it.
     """
     if accelerator not in DEVICES:
         raise ValueError(f"trainer.accelerator must be one of {', '.join(DEVICES)}, got {accelerator!r}")
@@ -41,25 +41,25 @@ def device_of(accelerator: str) -> torch.device:
     if kind == "cpu":
         return torch.device(kind)
     if not torch.get_device_module(kind).is_available():
-        raise ValueError(f"trainer={accelerator}: no {kind} device answers here; want trainer=cpu")
+        raise ValueError(f"trainer={accelerator}: torch finds no {kind} device; want trainer=cpu")
     compute_in_float32()
     return torch.device(kind, 0)
 
 
 def compute_in_float32() -> None:
-    """Keep a GPU from rounding what it convolves or multiplies to TF32's 11 bits, as torch lets cuDNN do by default.
+    """Keep a GPU from rounding the inputs of convolutions and matrix products to TF32's 11 bits.
 
-    Derivatives of the psi loop are central differences of losses, whose digits that rounding takes: on an H200 their
-    standard errors were 1.4 to 2.6 times the CPU's (docs/numerics.md).
+    torch allows that for convolutions by default. The psi loop takes central differences of losses, which lose digits
+    by that rounding: on an H200 their standard errors were 1.4 to 2.6 times the CPU's (docs/numerics.md).
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
 
 
 class Resident(SingleDeviceStrategy):
-    """One device, on which modules and optimisers stay, and whose memory stays with torch.
+    """A strategy for one device that leaves modules, optimisers and cached memory on it after a fit.
 
-    Lightning's own moves each tensor to the CPU after a fit and frees what the allocator keeps for the next one.
+    Lightning's own moves each tensor to the CPU and frees the memory that the allocator keeps for the next fit.
     """
 
     @override
@@ -68,7 +68,7 @@ class Resident(SingleDeviceStrategy):
 
 
 def trainer_on(device: torch.device, max_epochs: int = 1) -> Trainer:
-    """Make a Trainer for modules that lie on ``device``, with everything off that writes files or talks.
+    """Make a Trainer for modules on ``device`` that writes no files and prints nothing.
 
     It leaves signals to ``interruption``: under SLURM it would otherwise ignore SIGTERM and requeue the job itself.
     """
@@ -87,12 +87,12 @@ def trainer_on(device: torch.device, max_epochs: int = 1) -> Trainer:
 
 
 def at_once(on_cpu: int, device: torch.device) -> int:
-    """Return the batch size ``on_cpu``, which fits a cache, or ``CACHES`` times that on a GPU, where launches cost."""
+    """Return the batch size ``on_cpu``, which fits a cache; ``CACHES`` times that on a GPU, to launch fewer kernels."""
     return on_cpu if device.type == "cpu" else CACHES * on_cpu
 
 
 def moved(tensors: Sequence[torch.Tensor], device: torch.device | str) -> list[torch.Tensor]:
-    """Small tensors of one type on ``device``, in one copy."""
+    """Copy small tensors of one dtype to ``device`` in one transfer."""
     if all(tensor.device == torch.device(device) for tensor in tensors):
         return list(tensors)
     together = torch.cat([tensor.reshape(-1) for tensor in tensors]).to(device)
@@ -101,13 +101,13 @@ def moved(tensors: Sequence[torch.Tensor], device: torch.device | str) -> list[t
 
 
 def synchronise(device: torch.device) -> None:
-    """Wait for the device, so that a clock read next has its work in it; nothing on a CPU."""
+    """Wait until the device has finished, so that measured times include its work; does nothing on a CPU."""
     if device.type != "cpu":
         torch.get_device_module(device).synchronize(device)
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
-    """Most memory so far in MB: of the process (``peak_memory_mb``) and a GPU's tensors (``peak_gpu_memory_mb``)."""
+    """Return the peak memory so far in MB, of the process and of tensors on a GPU (``peak_gpu_memory_mb``)."""
     peaks = {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
     if device.type == "cuda":
         peaks["peak_gpu_memory_mb"] = torch.cuda.max_memory_allocated(device) / 2**20
@@ -115,16 +115,17 @@ def peak_memory_mb(device: torch.device) -> dict[str, float]:
 
 
 def forget_gpu_peak(device: torch.device) -> None:
-    """Start the count of ``peak_gpu_memory_mb`` anew; nothing on a CPU."""
+    """Reset ``peak_gpu_memory_mb``; does nothing on a CPU."""
     if device.type == "cuda":
-        torch.cuda.init()  # without which torch has no count to reset, and raises
+        torch.cuda.init()  # before it, torch has nothing to reset and raises
         torch.cuda.reset_peak_memory_stats(device)
 
 
 def peak_bytes(run: Callable[[], object], device: torch.device | None = None) -> int:
     """Measure the most bytes that tensors took at one time while ``run`` ran, beyond what they took before.
 
-    On a CPU (the default) by the profiler's record of every allocation, on a GPU by the allocator's own count.
+    The number comes from the profiler's record of all allocations on a CPU (the default), and from the allocator on a
+    GPU.
 
     Raises:
         RuntimeError: the profiler recorded no allocation.

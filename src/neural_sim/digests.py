@@ -11,13 +11,13 @@ import torch
 
 
 def digest(description: Mapping[str, Any]) -> str:
-    """Twenty hex digits of the SHA-256 of a description's canonical JSON. Raises ``TypeError`` for what JSON lacks."""
+    """Return 20 hex digits of the SHA-256 of canonical JSON. Raises ``TypeError`` for values that JSON cannot hold."""
     text = json.dumps(description, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 def tensor_digest(tensors: Iterable[torch.Tensor]) -> str:
-    """Digest of shapes, dtypes and values, for results whose inputs are tensors (such as psi)."""
+    """Return a digest of shapes, dtypes and values, for results whose inputs are tensors (such as psi)."""
     total = hashlib.sha256()
     for tensor in tensors:
         values = tensor.detach().cpu().contiguous()

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, JSON by the standard, read and written, and Markdown tables and sections."""
+"""Write files completely or not at all, read and write standard JSON, and make Markdown tables and sections."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PART = ".part"
 
 
 def finite(tree: Any) -> Any:
-    """Replace NaN and infinities by None, which JSON by the standard can hold; tuples become lists."""
+    """Replace NaN and infinities, which standard JSON cannot hold, by None; tuples become lists."""
     if isinstance(tree, Mapping):
         return {key: finite(value) for key, value in tree.items()}
     if isinstance(tree, (list, tuple)):
@@ -23,10 +23,10 @@ def finite(tree: Any) -> Any:
 
 
 def write_whole(path: Path, content: bytes | str) -> Path:
-    """Write a file, with its folder, at once: what is there stays until the new one is whole. Text is in UTF-8.
+    """Write a file completely or not at all, and make its folder. Text is in UTF-8.
 
     Raises:
-        OSError: what the system says, with the path (a full disk has none of its own).
+        OSError: the system's error, with the path added, which the error of a full disk lacks.
     """
     data = content.encode() if isinstance(content, str) else content
     part = path.with_name(f".{path.name}{PART}")
@@ -54,7 +54,7 @@ def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
         ``path``.
 
     Raises:
-        TypeError: for a value that JSON cannot hold.
+        TypeError: JSON cannot hold a value.
         OSError: as ``write_whole``.
     """
     return write_whole(path, json.dumps(finite(document), indent=indent, allow_nan=False))
@@ -64,7 +64,7 @@ def parsed_json(text: str | bytes) -> Any:
     """Parse JSON.
 
     Raises:
-        ValueError: what is no JSON, or is nested deeper than Python can follow.
+        ValueError: the text is not JSON, or is nested too deeply for Python.
     """
     try:
         return json.loads(text)
@@ -76,7 +76,7 @@ def read_json(path: Path) -> Any:
     """Read a JSON file in UTF-8, with or without a byte order mark.
 
     Raises:
-        ValueError: a file that is missing, cannot be read or is no JSON, with its path.
+        ValueError: the file is missing, cannot be read or is not JSON; the message has its path.
     """
     try:
         return parsed_json(path.read_text(encoding="utf-8-sig"))
@@ -92,7 +92,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
         rows: cells of each row, as many as ``head`` has.
 
     Raises:
-        ValueError: for a row of another length.
+        ValueError: a row has another length.
     """
     lines = [_line(head), "|" + "---|" * len(head)]
     for row in rows:
@@ -107,15 +107,15 @@ def _line(cells: Sequence[object]) -> str:
 
 
 def replace_section(path: Path, name: str, markdown: str) -> None:
-    """Write one section, ``## name``, of a Markdown file, which is made where there is none; the rest stays as it is.
+    """Write the section ``## name`` of a Markdown file, which is created if it does not exist; other text is kept.
 
     The section stands between ``<!-- begin: name -->`` and ``<!-- end: name -->``; a new one goes to the end.
 
     Raises:
-        ValueError: where the file has one marker without the other, out of order, or more than once.
+        ValueError: the file has one marker without the other, or has them out of order or more than once.
     """
     begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-    body = markdown.rstrip().lstrip("\n")  # spaces at the beginning make a code block
+    body = markdown.rstrip().lstrip("\n")  # not leading spaces, which make a code block
     block = f"{begin}\n## {name}\n\n{body}\n\n{end}\n"
     text = path.read_text() if path.exists() else ""
     counts = text.count(begin), text.count(end)

@@ -1,4 +1,4 @@
-"""Packages that only some inputs, outputs and ways to run need: the extras of pyproject.toml."""
+"""Optional packages, needed for some inputs, outputs and ways to run only: the extras of pyproject.toml."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PACKAGES = {
     "ray": ("ray",),
     "sweeps": ("hydra_plugins.hydra_joblib_launcher", "hydra_plugins.hydra_submitit_launcher"),
 }
-"""The modules that each extra installs."""
+"""The modules that each extra provides."""
 
 
 def require(extra: str, what: str) -> None:
@@ -24,10 +24,10 @@ def require(extra: str, what: str) -> None:
 
     Args:
         extra: a key of ``PACKAGES``.
-        what: what needs them, with which the message begins: a configuration key or a file.
+        what: the configuration key or file that needs them, for the beginning of the message.
 
     Raises:
-        UserError: for packages that are missing, with the command that installs them.
+        UserError: packages are missing; the message has the command that installs them.
     """
     if missing := missing_of(extra):
         raise UserError(f"{what}: {', '.join(missing)} not installed; pip install 'neural-sim[{extra}]'")
@@ -39,6 +39,6 @@ def missing_of(extra: str) -> list[str]:
 
 
 def _installed(name: str) -> bool:
-    with suppress(ModuleNotFoundError):  # of the package that it is in
+    with suppress(ModuleNotFoundError):  # raised if the parent package is missing
         return importlib.util.find_spec(name) is not None
     return False

@@ -1,4 +1,4 @@
-"""The commands of ``neural-sim``, which stand for words of the same configuration, and what ``--help`` says."""
+"""The commands of ``neural-sim``, which are short for settings of the configuration, and the text of ``--help``."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Verb:
 
     Attributes:
         says: what it does.
-        words: what it stands for.
-        keys: those that its help shows, with their comments in ``conf/``.
-        example: more words that go with it.
+        words: the settings that it stands for.
+        keys: the keys that its help shows, with their comments in ``conf/``.
+        example: words that follow it in an example.
     """
 
     says: str
@@ -29,7 +29,7 @@ class Verb:
 
 VERBS = {
     "demo": Verb(
-        "learn which poses of the embedded objects to render; minutes on two cores",
+        "learn which poses of the embedded objects to render; takes minutes on two cores",
         ("+experiment=pose_gap",),
         ("scale", "seed", "baseline", "gap", "outer.iterations"),
         "scale=smoke",
@@ -50,7 +50,7 @@ VERBS = {
         "objects=photos objects.root=/data/captures",
     ),
     "check": Verb(
-        "say before any optimisation whether it is worth it (preflight.html)",
+        "estimate whether an optimisation is worth running (preflight.html)",
         ("stages=[preflight]",),
         ("objects", "target", "target.annotations", "parameter", "preflight.trials", "preflight.moved"),
         "objects=photos objects.root=/data/captures target=coco target.annotations=/data/val.json",
@@ -72,13 +72,13 @@ VERBS = {
         "objects=photos objects.root=/data/captures target=coco target.annotations=/data/val.json",
     ),
     "score": Verb(
-        "train and score the detectors of what was learned, without the report",
+        "train and score detectors on the learned distribution, without the report",
         ("stages=[evaluate]",),
         ("detector", "training.cold_epochs", "training.images_per_object", "seed"),
         "+experiment=pose_gap",
     ),
     "export": Verb(
-        "write a data set of drawn images: COCO, YOLO or BOP",
+        "write a data set of annotated images: COCO, YOLO or BOP",
         ("stages=[export]",),
         (
             "export.count",
@@ -92,7 +92,7 @@ VERBS = {
         "+experiment=pose_gap export.count=300 export.psi=initial",
     ),
     "predict": Verb(
-        "detect with a trained model on photographs, and score it where they are labelled",
+        "detect objects in photographs with a trained model, and score it if they are labelled",
         ("stages=[predict]",),
         (
             "predict.model",
@@ -110,13 +110,13 @@ VERBS = {
         "+experiment=pose_gap",
     ),
     "box": Verb(
-        "set the box about a photographed object by hand, where the scene's masks miss it",
+        "set the box around a photographed object by hand, if computed masks miss it",
         ("stages=[box]", "objects=photos"),
         ("objects.root", "box.object", "box.port", "box.seconds"),
         "objects.root=/data/captures objects/poses=colmap",
     ),
     "compare": Verb(
-        "set the finished runs of an experiment side by side",
+        "compare the finished runs of an experiment",
         ("+experiment=compare",),
         ("compare.experiments", "compare.clock", "paths.mlflow"),
         "'compare.experiments=[pose_gap]'",
@@ -137,7 +137,7 @@ def spoken(words: Sequence[str]) -> list[str]:
 
 
 def answer(words: Sequence[str], layout: Layout) -> str | None:
-    """Answer ``--version``, ``--help``, ``COMMAND --help`` and ``--help keys``; None for all else."""
+    """Answer ``--version``, ``--help``, ``COMMAND --help`` and ``--help keys``; None for other words."""
     if "--version" in words:
         return f"neural-sim {neural_sim.__version__}"
     if not {"--help", "-h"} & set(words):
@@ -162,11 +162,11 @@ def _help(layout: Layout) -> str:
         *_wrapped("without data of your own: ", embedded),
         *_wrapped("with other data: ", others),
         "",
-        "Choices (GROUP=CHOICE; the first is made unless you make another)",
+        "Choices (GROUP=CHOICE; the first is the default)",
         *(_choices(group, layout) for group in layout.defaults),
         "",
         "Keys: --help keys. Sweeps: -m seed=0,1,2. Words with brackets, braces or spaces need quotes in most shells.",
-        'Completion of the shell: eval "$(neural-sim -sc install=bash)"',
+        'Shell completion: eval "$(neural-sim -sc install=bash)"',
     ]
     return "\n".join(lines)
 
@@ -212,7 +212,7 @@ def _line(key: str, layout: Layout) -> str:
 
 
 def _all_keys(layout: Layout) -> str:
-    """Write config.yaml's own text, and that of the chosen groups after it."""
+    """Return the text of config.yaml, followed by that of the default choices."""
     base = (layout.folders[0] / "config.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0]
     parts = [base]
     for group, default in layout.defaults.items():

@@ -1,8 +1,8 @@
-"""The end of a command that is told to end: by SIGTERM (``kill``, a scheduler) or by SIGINT (Ctrl-C).
+"""End a command within two seconds of SIGTERM (``kill``, a scheduler) or SIGINT (Ctrl-C).
 
-The signal becomes an exception, on whose way out everything that is open is closed. That takes too long where the main
-thread is in a long call of compiled code, and never happens where a library swallows the exception. So a thread, which
-hears of the signal at once, says that the process ends and after ``LIMIT`` seconds ends it.
+The signal becomes an exception in the main thread, which closes everything that is open. That takes too long during a
+long call of compiled code, and never happens if a library swallows the exception. So a second thread, which is told of
+the signal at once, prints a line and ends the process after ``LIMIT`` seconds.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from typing_extensions import override
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 UNWINDING = 1.2
-"""Seconds for the main thread to end by the exception, before its last acts are done in its place."""
+"""Seconds that the main thread has to end by the exception, before another thread calls the last acts."""
 LIMIT = 1.7
-"""Seconds after which the process has ended."""
-_LINE = "neural-sim: ended by {}; the same command goes on with the results that are in the store\n"
+"""Seconds after which the process is ended."""
+_LINE = "neural-sim: ended by {}; the same command resumes from the results in the store\n"
 _last_acts: list[Callable[[Interrupted], object]] = []
 
 
 class Interrupted(SystemExit):
-    """The command was told to end. Its code is the exit status, 128 and the signal's number, as shells have it."""
+    """The command was told to end. Its code is the exit status, 128 plus the signal's number, as in shells."""
 
     def __init__(self, signum: int) -> None:
         self.status = 128 + signum
@@ -44,7 +44,7 @@ class Interrupted(SystemExit):
 
 @contextmanager
 def last_act(act: Callable[[Interrupted], object]) -> Iterator[None]:
-    """Have ``act`` called by another thread if the process must end before what is inside has ended by itself."""
+    """Call ``act`` from another thread if the process must end while this context is still open."""
     _last_acts.append(act)
     try:
         yield
@@ -54,9 +54,9 @@ def last_act(act: Callable[[Interrupted], object]) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let SIGTERM and Ctrl-C end the process within two seconds, with status 143 and 130 and one line.
+    """Let SIGTERM and Ctrl-C end the process within two seconds, with one line and status 143 or 130.
 
-    A signal that the process was started to ignore stays ignored, as Ctrl-C is by jobs in a shell's background.
+    A signal that was ignored when the process started stays ignored, such as Ctrl-C in background jobs of a shell.
     """
     ending = _Ending()
     reading, writing = os.pipe()
@@ -72,7 +72,7 @@ def interruptible() -> Iterator[None]:
         if ending.error is not None:
             ending.told.wait(LIMIT)
             _flush()
-            # At once: with all libraries loaded Python takes seconds to end, in which no thread runs.
+            # Without Python's own exit: with all libraries loaded it takes seconds, in which no thread runs.
             os._exit(ending.error.status)
         for signum, handler in before.items():
             signal.signal(signum, handler)
@@ -85,10 +85,10 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def signals_kept() -> Iterator[None]:
-    """Take signals back from a library that is imported inside and handles them in compiled code.
+    """Restore the signal handlers that a library replaces by compiled code when it is imported inside this context.
 
-    pycolmap's logging does: at SIGTERM it prints a stack from within the signal, which can wait for ever for the lock
-    of an allocation that the signal interrupted.
+    pycolmap's logging does so: its handler of SIGTERM prints a stack trace, which can wait forever for the lock of an
+    allocation that the signal interrupted.
     """
     before = {signum: signal.getsignal(signum) for signum in SIGNALS}
     try:
@@ -96,13 +96,13 @@ def signals_kept() -> Iterator[None]:
     finally:
         if threading.current_thread() is threading.main_thread():
             for signum, handler in before.items():
-                if handler is not None:  # None: set by compiled code before, and unknown to Python
+                if handler is not None:  # None: compiled code had set it before, and Python does not know it
                     signal.signal(signum, handler)
 
 
 @contextmanager
 def ctrl_c_as_exception() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt, for what it ends in the ordinary way."""
+    """Let Ctrl-C raise KeyboardInterrupt inside this context, for work that it is meant to end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -114,19 +114,19 @@ def ctrl_c_as_exception() -> Iterator[None]:
 
 
 def this_process() -> str:
-    """Return a name of this process that no other one ever has: its host and boot, namespace, number and start."""
+    """Return a name that no other process ever has: host and boot, namespace, process number and start time."""
     return f"{_machine()} {_namespace()} {os.getpid()} {_start_of(os.getpid())}"
 
 
 def has_ended(process: str) -> bool:
-    """Tell whether the process of a ``this_process`` has ended; False where this one cannot know."""
+    """Return whether the process with this name (see ``this_process``) has ended; False if that cannot be known."""
     try:
         machine, namespace, pid, start = process.split(" ")
     except ValueError:
         return False
     if not start or machine.partition("/")[0] != platform.node():
         return False
-    if machine != _machine():  # the host has started again since
+    if machine != _machine():  # the host has rebooted since
         return True
     return namespace == _namespace() and _start_of(int(pid)) != start
 
@@ -138,14 +138,14 @@ def _machine() -> str:
 
 
 def _namespace() -> str:
-    """Return in which count of processes numbers are: containers of one host have their own."""
+    """Return the namespace of process numbers: containers on one host have their own."""
     with suppress(OSError):
         return os.readlink("/proc/self/ns/pid")
     return ""
 
 
 def _start_of(pid: int) -> str:
-    """Return when a process began, in ticks since the boot; empty where there is none, or no /proc."""
+    """Return when a process started, in ticks since the boot; empty if there is no such process, or no /proc."""
     with suppress(OSError, IndexError):
         # The name, in parentheses, may have spaces; the start is the 20th field after it (proc(5)).
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
@@ -153,20 +153,20 @@ def _start_of(pid: int) -> str:
 
 
 class _Ending:
-    """The end of a command at its first signal; later ones change nothing."""
+    """Ends a command at its first signal; later signals change nothing."""
 
     def __init__(self) -> None:
         self.error: Interrupted | None = None
         self.told = threading.Event()
 
     def interrupt(self, signum: int, _: FrameType | None) -> None:
-        """Raise, in the main thread, as soon as it is in Python code."""
+        """Raise in the main thread. As a signal handler, it runs as soon as that thread executes Python code."""
         if self.error is None:
             self.error = Interrupted(signum)
             raise self.error
 
     def watch(self, descriptor: int) -> None:
-        """Wait for the first signal, say so, and end the process in time if it has not ended by then."""
+        """Wait for the first signal, report it, and end the process if it has not ended in time."""
         signum = 0
         while signum not in SIGNALS or signal.getsignal(signum) is signal.default_int_handler:
             signum = os.read(descriptor, 1)[0]

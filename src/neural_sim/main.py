@@ -56,13 +56,14 @@ _log = logging.getLogger(__name__)
 OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 OmegaConf.register_new_resolver("view_size", view_size, replace=True)
 
-# Top-level nodes that an experiment is built from, each with a ``_target_``; `parameter` holds one for each parameter.
+# Top-level nodes that an experiment is built from, each with a ``_target_``. In addition, `parameter` has a node for
+# each parameter.
 _PARTS = (
     "objects", "views", "field", "renderer", "synthesis", "target", "camera", "detector", "solver", "baseline",
     "gradient", "outer", "training", "unlearned", "model",
 )  # fmt: skip
 
-# Types of the top level's own values.
+# Types of top-level values.
 _TOP = {
     "seed": NonNegativeInt,
     "stages": Annotated[list[str], MinLen(1)],
@@ -76,10 +77,10 @@ _TOP = {
 
 
 def build(config: DictConfig) -> Experiment:
-    """Every part of an experiment from its group, validated before any stage runs.
+    """Build every part of an experiment from its group, all validated before any stage runs.
 
     Raises:
-        UserError: an unknown key, a value of the wrong type or out of range, with the key and what was got.
+        UserError: a key is unknown, or a value has the wrong type or is out of range; the message has key and value.
     """
     return _build(_plain(config))
 
@@ -113,16 +114,16 @@ def _build(plain: dict[str, Any]) -> Experiment:
 
 
 Recompose = Callable[[Sequence[str]], DictConfig]
-"""The configuration of the same command with other choices, as overrides."""
+"""Takes choices as overrides, and returns the configuration of the same command with them."""
 
 
 def context_of(
     config: DictConfig, folder: Path, recompose: Recompose | None = None
 ) -> tuple[Context, dict[str, Task]]:
-    """Return a run in ``folder`` and its tasks by name: phases of a run first, in their order.
+    """Return the context of a command in ``folder``, and its tasks by name: first the phases of a run, in their order.
 
-    The experiment is built at once where phases of a run are asked for, so that bad settings are refused before
-    anything else. With ``recompose`` tasks can build the experiment of another method.
+    If phases of a run are asked for, the experiment is built at once, so that bad settings are refused before anything
+    else. With ``recompose``, tasks can build the experiment of another method.
 
     Raises:
         UserError: as ``build``, and for an unknown entry of ``stages``.
@@ -158,7 +159,7 @@ def _is_task(node: Any) -> bool:
 
 
 def _camera(parts: Mapping[str, Any]) -> Any:
-    """Of synthesised and of rendered target images."""
+    """Return the camera of synthesised images and of rendered target images."""
     views = parts["views"]
     try:
         return parts["camera"].camera(parts["training"].image_size, views.field_of_view_deg, parts["target"])
@@ -167,7 +168,7 @@ def _camera(parts: Mapping[str, Any]) -> Any:
 
 
 def _with_cameras(objects: Any, run: Any) -> Any:
-    """Return the objects; cameras of photographs alone are found, or read from the store."""
+    """Return the objects; if photographs have no cameras, these are computed, or read from the store."""
     from neural_sim.objects.photos import Photos
     from neural_sim.stages.cameras import with_cameras
     from neural_sim.stages.stage import Results
@@ -182,7 +183,7 @@ def _with_cameras(objects: Any, run: Any) -> Any:
 
 
 def _covered(distribution: Any, parameters: Mapping[str, Any], objects: Any) -> tuple[Any, Any]:
-    """p_psi without the bins that no photograph shows, unless these are wanted; and what photographs show."""
+    """Return p_psi without the bins that photographs do not cover, unless these are rendered too, and the coverage."""
     from neural_sim.objects.photos import Photos
     from neural_sim.parameter.coverage import coverages
     from neural_sim.parameter.pose import Pose
@@ -201,7 +202,7 @@ def _covered(distribution: Any, parameters: Mapping[str, Any], objects: Any) -> 
 
 
 def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
-    """p_psi over all parameters, as far as views, renderer and estimator can serve it."""
+    """Return p_psi over all parameters, and refuse anchor lights that the views do not have."""
     from neural_sim.parameter.product import SceneDistribution
 
     try:
@@ -250,7 +251,7 @@ def _instantiate(node: Any, where: str) -> Any:
 
 
 def _told(message: str, node: Mapping[str, Any], where: str, inner: str) -> str:
-    """Name a constructor's complaint, which may begin with ``Class.argument``, by the whole key."""
+    """Return a constructor's message, which may begin with ``Class.argument``, with the whole key instead."""
     made: Any = node
     for key in filter(None, inner.split(".")):
         made, where = made.get(key) if isinstance(made, Mapping) else None, f"{where}.{key}"
@@ -262,7 +263,7 @@ def _told(message: str, node: Mapping[str, Any], where: str, inner: str) -> str:
 
 
 def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
-    """Return a command's overrides with ``choices`` in the place of those of the same groups."""
+    """Return a command's overrides, with ``choices`` in place of those of the same groups."""
     chosen = {choice.partition("=")[0] for choice in choices}
     return [*(o for o in overrides if o.partition("=")[0].lstrip("+") not in chosen), *choices]
 
@@ -270,7 +271,7 @@ def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
 @hydra.main(version_base="1.3", config_path=str(conf_directory()), config_name="config")
 def _task(config: DictConfig) -> float | None:
     runtime = HydraConfig.get()
-    # Libraries on each other's deprecations: nothing that a user of this program can act on.
+    # Warnings of libraries about each other's deprecations, which a user of this program cannot act on.
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*")
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
     try:
@@ -297,8 +298,8 @@ def _task(config: DictConfig) -> float | None:
 class RefuseStudies(Callback):
     """Stops a study whose data is missing or whose settings are wrong before its first job.
 
-    A study is an experiment that sweeps by itself, by ``hydra.sweeper.params``. Each of its jobs would fail in the same
-    way.
+    A study, here, is an experiment with a sweep of its own, ``hydra.sweeper.params``. All its jobs would fail in the
+    same way.
     """
 
     @override
@@ -313,16 +314,16 @@ class RefuseStudies(Callback):
 
 
 class OwnFolder(Callback):
-    """Gives runs, or sweeps, of an experiment that begin in the same second folders of their own.
+    """Gives each run or sweep its own folder, even if another one of the experiment starts in the same second.
 
-    Folders are named by the second. One that the command line names is taken as it is.
+    Folders are named by date and time. A folder that the command line names is used as it is.
     """
 
     @override
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         self._take(config, "run")
         folder = Path(config.hydra.run.dir)
-        try:  # as Hydra would, with two screens of its own calls where that fails
+        try:  # Hydra would make it too, but print a stack trace of two screens if that fails
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             _refuse(
@@ -357,18 +358,18 @@ class SweepTable(Callback):
 
 
 def _refuse(error: Exception) -> NoReturn:
-    """One line, and exit status 2."""
+    """Print an error as one line, and exit with status 2."""
     _log.debug("details", exc_info=True)
     line = first_line(error)
     if isinstance(error, OSError) and error.filename is not None:
-        line = f"{error.filename}: {error.strerror}; nothing that was finished before is lost"
+        line = f"{error.filename}: {error.strerror}; finished results are kept"
     print(f"neural-sim: {line}", file=sys.stderr)
     sys.exit(2)
 
 
 def main() -> None:
-    """Entry point of ``neural-sim`` and ``python -m src.main``."""
-    logging.raiseExceptions = False  # a log on a full disk would print a stack for each of its lines
+    """Run ``neural-sim`` or ``python -m src.main``."""
+    logging.raiseExceptions = False  # a log on a full disk would print a stack trace for each of its lines
     with interruptible():
         layout = layout_of(sys.argv[1:], conf_directory())
         if layout is not None and (said := answer(sys.argv[1:], layout)) is not None:
@@ -381,9 +382,8 @@ def main() -> None:
             if layout is not None:
                 checked(sys.argv[1:], layout, VERBS)
                 present(sys.argv[1:])
-            os.environ.setdefault(
-                "HYDRA_FULL_ERROR", "1"
-            )  # errors come here instead of to stderr in many lines
+            # Errors are raised here instead of printed by Hydra in many lines.
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")
             _task()
         except UserError as error:
             _refuse(error)

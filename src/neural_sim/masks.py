@@ -1,4 +1,4 @@
-"""The one reader of masks: which pixels of a photograph are the object's."""
+"""The one reader of masks, which say which pixels of a photograph show the object."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from neural_sim.pictures import WHITE, alpha_of, eight_bits, load
 
 _LOSSY = ("JPEG", "MPO", "WEBP")
 _MOST_LABELS = 32
-"""A mask whose largest value is below it holds labels, if there are more than two values."""
+"""If all values of a mask are smaller, and there are more than two of them, they are labels."""
 _LEAST_AREA = 400
-"""Pixels of an object that is too large to be grey all over because its edge is soft."""
+"""An object of at least this many pixels is too large to be mostly grey because of a soft edge."""
 _SPREAD = 32
-"""How far the channels of a grey pixel may differ, in a mask that has been compressed once."""
+"""Largest difference between the channels of a grey pixel; compression makes them differ."""
 
 
 def read_mask(path: Path, value: int | None = None) -> Float[np.ndarray, "height width"]:
@@ -24,15 +24,17 @@ def read_mask(path: Path, value: int | None = None) -> Float[np.ndarray, "height
 
     Args:
         path: the file.
-        value: the object's, in an image of labels (grey values, or indices of a palette); None: as follows.
+        value: the object's label in an image of labels (grey values, or indices of a palette). None: the opacity is
+            found as described here.
 
-    Two values, whichever they are, are the background and the object, the darker or smaller being the background; one
-    value other than 0 is the object. More values of grey are opacities by the format's white. Of a coloured palette the
-    index counts. A picture with an alpha channel is a mask by its alpha where that says something, else by its colours.
+    If there are two values, whichever they are, the darker or smaller one is the background and the other the object.
+    If there is only one, it is the object unless it is 0. More values of grey are opacities relative to the format's
+    white. In a coloured palette, the indices count. A picture with an alpha channel is read by its alpha if that
+    varies, else by its colours.
 
     Raises:
-        ValueError: a file that cannot be read, or several labels or colours, of which none is known to be the object's;
-            colours where ``value`` is given.
+        ValueError: the file cannot be read; nothing says which of several labels or colours is the object's; or
+            ``value`` is given for a file with colours.
     """
     image, where = load(path, str(path))[0], str(path)
     if value is not None:
@@ -58,7 +60,7 @@ def read_mask(path: Path, value: int | None = None) -> Float[np.ndarray, "height
 
 
 def _grey(values: np.ndarray, where: str, lossy: bool = False) -> Float[np.ndarray, "height width"]:
-    """Return the opacity that numbers of one channel say."""
+    """Return the opacity that the values of one channel mean."""
     if values.dtype == bool:
         return values.astype(np.float32)
     levels = np.unique(values)
@@ -70,7 +72,7 @@ def _grey(values: np.ndarray, where: str, lossy: bool = False) -> Float[np.ndarr
     white = 255.0 if values.dtype == np.uint8 else WHITE if whole else 1.0
     if not (levels[0] >= 0 and levels[-1] <= white):
         raise ValueError(
-            f"{where}: a mask wants values from 0 to {white:g}, got {levels[0]:g} to {levels[-1]:g}"
+            f"{where}: want a mask with values from 0 to {white:g}, got {levels[0]:g} to {levels[-1]:g}"
         )
     opacity = values.astype(np.float32) / np.float32(white)
     some, between = opacity > 0.1, (opacity > 0.1) & (opacity < 0.9)
@@ -81,7 +83,7 @@ def _grey(values: np.ndarray, where: str, lossy: bool = False) -> Float[np.ndarr
 
 
 def _coloured(picture: Image.Image, where: str, lossy: bool) -> Float[np.ndarray, "height width"]:
-    """Return the opacity that colours say."""
+    """Return the opacity that colours mean."""
     light = np.asarray(picture.convert("L"))
     if lossy or _is_grey(picture):
         return _grey(light, where, lossy)
@@ -102,7 +104,7 @@ def _labels(values: np.ndarray, where: str) -> Float[np.ndarray, "height width"]
 
 
 def _two(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height width"]:
-    """Return 1 where the larger of two values stands; a single one other than 0 is the object."""
+    """Return 1 where a mask has the larger of its two values; a single value other than 0 is 1 everywhere."""
     if len(levels) == 1:
         return np.full(values.shape, float(levels[0] > 0), dtype=np.float32)
     return (values == levels[-1]).astype(np.float32)
@@ -110,8 +112,8 @@ def _two(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height wi
 
 def _several(where: str, what: str, count: int) -> str:
     return (
-        f"{where}: holds {count} {what}; want a mask of one object, with two values or with opacities in grey; of "
-        "labels, objects.mask_value says which is the object's"
+        f"{where}: holds {count} {what}; want a mask of one object, with two values or with opacities in grey; for "
+        "labels, set objects.mask_value to the object's"
     )
 
 

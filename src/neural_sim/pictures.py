@@ -1,7 +1,7 @@
 """The one reader of pictures: targets, predictions, backgrounds, cut-outs, captures and textures.
 
-Pictures become 8-bit RGB or RGBA as a viewer shows them, upright by their EXIF orientation. White is 65535 in grey of
-16 bits and 1 in floats. What cannot be read is a ``ValueError`` of one line that names the file.
+Pictures become 8-bit RGB or RGBA as a viewer shows them, upright by their EXIF orientation. White is 65535 in 16-bit
+grey and 1 in floats. A file that cannot be read raises ``ValueError``, with one line that names the file.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ Size = tuple[int, int]
 """Width and height in pixels."""
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".png", ".bmp", ".webp", ".tif", ".tiff")
 OTHER_FORMATS = (".heic", ".heif", ".avif", ".gif", ".jxl", ".exr", ".dng", ".cr2", ".nef", ".arw", ".raw")
-"""Pictures that are not read: those of telephones, cameras, the web and renderers."""
+"""Suffixes of pictures that are not read, from phones, cameras, the web and renderers."""
 CUTOUT_SUFFIXES = (".png", ".webp", ".tif", ".tiff")
-"""Formats with an alpha channel."""
+"""Suffixes of formats with an alpha channel."""
 LEFTOVERS = frozenset({"__MACOSX", "@eaDir", ".ipynb_checkpoints", ".thumbnails", ".Trashes", "$RECYCLE.BIN"})
 """Folders that other programs leave among pictures."""
 APPLE_DOUBLE = "._"
-"""Beginning of the files in which a Mac keeps attributes of others; they have the others' suffixes."""
+"""Prefix of the files in which macOS keeps attributes of other files; they have the suffixes of those files."""
 
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -40,29 +40,29 @@ _UPRIGHT = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""What turns a picture upright, by its EXIF orientation."""
+"""The operation that turns a picture upright, by EXIF orientation."""
 WHITE = 65535.0
-"""White of 16 bits."""
+"""White in 16 bits."""
 
 
 # --- files ---
 
 
 def picture_files(root: Path, suffixes: Collection[str] = PHOTO_SUFFIXES) -> list[Path]:
-    """List the pictures under a folder, at any depth, by name; leftovers of other programs are counted in the log."""
+    """List the pictures under a folder, at any depth, sorted; the log counts the leftovers of other programs."""
     files = sorted(path for path in root.rglob("*") if path.is_file())
     say_strange(root, files, OTHER_FORMATS)
     return without_leftovers([path for path in files if path.suffix.lower() in suffixes], root)
 
 
 def say_strange(root: Path, files: Iterable[Path], suffixes: Collection[str]) -> list[str]:
-    """Count the files of formats that are not read in the log, and return their names."""
+    """Log how many files have formats that are not read, and return their names."""
     strange = [
         path.name for path in files if path.suffix.lower() in suffixes and not _left_over(Path(path.name))
     ]
     if strange:
         _say_once(
-            "%s: %d files such as %s are of a format that is not read, and left out",
+            "%s: %d files such as %s have a format that is not read, and are left out",
             root,
             len(strange),
             strange[0],
@@ -71,7 +71,7 @@ def say_strange(root: Path, files: Iterable[Path], suffixes: Collection[str]) ->
 
 
 def without_leftovers(paths: Sequence[Path], root: Path) -> list[Path]:
-    """Leave out what other programs left among the files below ``root``, and count it in the log."""
+    """Leave out the files that other programs left below ``root``, and log how many there are."""
     kept = [path for path in paths if not _left_over(path.relative_to(root))]
     if len(kept) < len(paths):
         example = next(path for path in paths if _left_over(path.relative_to(root)))
@@ -94,13 +94,13 @@ def _say_once(message: str, *about: object) -> None:
 
 @dataclass(frozen=True)
 class Header:
-    """What the head of a picture's file says.
+    """What the header of a picture's file says.
 
     Args:
-        stored: the size of the pixels as they lie in the file.
-        orientation: of EXIF, 1 to 8; 1 is upright.
-        mode: Pillow's name of what a pixel is.
-        format: Pillow's name of the file's format.
+        stored: size of the picture as it is stored.
+        orientation: EXIF orientation, 1 to 8; 1 is upright.
+        mode: Pillow's name for the type of the pixels.
+        format: Pillow's name for the format of the file.
         transparent: whether pixels may be transparent.
     """
 
@@ -117,7 +117,7 @@ class Header:
 
     @property
     def turning(self) -> str:
-        """What messages about sizes add: how EXIF turns the picture, empty where it does not."""
+        """An addition to messages about sizes that says how EXIF turns the picture; empty if it does not."""
         if self.orientation == 1:
             return ""
         return f"; its EXIF orientation {self.orientation} shows the stored {by(self.stored)} as {by(self.shown)}"
@@ -131,19 +131,18 @@ def read_header(path: Path, where: str = "") -> Header:
         where: what messages begin with; empty: the path.
 
     Raises:
-        ValueError: no such file, or one whose head is not a picture's.
+        ValueError: the file does not exist, or does not begin like a picture.
     """
     with _named(where or str(path)), Image.open(path) as image:
-        count = (
-            1 if image.format == "MPO" else getattr(image, "n_frames", 1)
-        )  # telephones keep a depth map there
+        # Phones keep a depth map as the second picture of an MPO file.
+        count = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
         if count > 1:
             _say_once("%s: holds %d pictures, the first is taken", path, count)
         return Header(image.size, _orientation(image), image.mode, image.format, image.has_transparency_data)
 
 
 def read_exif(path: Path) -> dict[int, object]:
-    """Return what a picture's EXIF says by its tags; nothing where there is none, or it is damaged."""
+    """Return the values of a picture's EXIF by tag; empty if there is no EXIF, or it is damaged."""
     try:
         with Image.open(path) as image:
             held = image.getexif()
@@ -153,14 +152,14 @@ def read_exif(path: Path) -> dict[int, object]:
 
 
 def check_headers(paths: Iterable[Path], key: str) -> None:
-    """Refuse pictures that cannot be read by what their headers say, before anything is computed.
+    """Refuse pictures whose headers show that they cannot be read, before anything is computed.
 
     Args:
         paths: the files.
         key: the setting that they come from, for messages.
 
     Raises:
-        ValueError: as ``read_header`` does, or a mode that ``read_picture`` refuses.
+        ValueError: as ``read_header``, or a picture has a mode that ``read_picture`` refuses.
     """
     for path in paths:
         where = f"{key}: {path}"
@@ -169,22 +168,22 @@ def check_headers(paths: Iterable[Path], key: str) -> None:
 
 
 def _orientation(image: Image.Image) -> int:
-    """Return the EXIF orientation, 1 where there is none. Pillow turns TIFF itself."""
+    """Return the EXIF orientation, 1 if there is none. Pillow turns TIFF itself."""
     known = any(key in image.info for key in ("exif", "Raw profile type exif", "xmp", "XML:com.adobe.xmp"))
-    if image.format == "TIFF" or (image.format == "PNG" and not known):  # else all of a PNG would be decoded
+    if image.format == "TIFF" or (
+        image.format == "PNG" and not known
+    ):  # reading EXIF would decode the whole PNG
         return 1
     try:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except (
-        Exception
-    ):  # damaged EXIF, of which Pillow's parsers raise many kinds, says nothing about the pixels
+    except Exception:  # Pillow raises many kinds on damaged EXIF, and the pixels may be sound
         return 1
     return orientation if orientation in _UPRIGHT else 1
 
 
 @contextmanager
 def _named(where: str) -> Iterator[None]:
-    """Turn all that Pillow raises on a damaged or unknown file into one line with its name."""
+    """Turn any error of Pillow on a damaged or unknown file into one line that names the file."""
     try:
         yield
     except Exception as error:
@@ -206,10 +205,10 @@ def read_picture(path: Path | BytesIO, where: str = "", upright: bool = True) ->
     Args:
         path: the file, or its bytes.
         where: what messages begin with; empty: the path.
-        upright: whether EXIF turns it; False for pixels as they are stored, which the cameras of captures are of.
+        upright: whether EXIF turns it; False keeps pixels as they are stored, to which the cameras of captures refer.
 
     Raises:
-        ValueError: no such file, one that cannot be read to its end, or a mode that has no known black and white.
+        ValueError: the file does not exist or cannot be read to its end, or its mode has no known black and white.
     """
     where = where or str(path)
     image, orientation = load(path, where)
@@ -221,11 +220,11 @@ def read_picture(path: Path | BytesIO, where: str = "", upright: bool = True) ->
 
 
 def load(path: Path | BytesIO, where: str) -> tuple[Image.Image, int]:
-    """Read a picture as it is stored, and its EXIF orientation. Raises ``ValueError`` where it cannot be read."""
+    """Read a picture as it is stored, and its EXIF orientation. Raises ``ValueError`` if it cannot be read."""
     with _named(where), Image.open(path) as image:
         if image.format != "PNG":
             return _whole(image)
-        image.verify()  # checksums, which decoding does not look at
+        image.verify()  # checksums, which decoding does not check
     if isinstance(path, BytesIO):
         path.seek(0)
     with _named(where), Image.open(path) as image:
@@ -246,7 +245,7 @@ def eight_bits(image: Image.Image, where: str = "picture") -> Image.Image:
         where: what messages begin with.
 
     Raises:
-        ValueError: a mode that has no known black and white, or values beyond them.
+        ValueError: the mode has no known black and white, or values lie outside them.
     """
     refuse_mode(image.mode, image.format, where)
     if image.mode == "F" or image.mode.startswith("I"):
@@ -258,15 +257,13 @@ def eight_bits(image: Image.Image, where: str = "picture") -> Image.Image:
 def refuse_mode(mode: str, format: str | None, where: str) -> None:
     """Raise ``ValueError`` for a picture's mode that has no known black and white."""
     if mode == "I" and format not in ("PNG", "PPM"):  # these have at most 16 bits
-        raise ValueError(
-            f"{where}: integers of 32 bits (mode I) have no known white; save it with 8 or 16 bits"
-        )
+        raise ValueError(f"{where}: 32-bit integers (mode I) have no known white; save it with 8 or 16 bits")
     if mode in ("LAB", "La"):
         raise ValueError(f"{where}: pictures of mode {mode} are not read; save it as RGB")
 
 
 def _scaled(image: Image.Image, where: str) -> Image.Image:
-    """Scale grey of 16 bits, or of floats in [0, 1], to 8 bits."""
+    """Scale 16-bit grey, or floats in [0, 1], to 8 bits."""
     values, white = np.asarray(image), 1.0 if image.mode == "F" else WHITE
     if not (values.size and values.min() >= 0 and values.max() <= white):  # NaN is refused too
         raise ValueError(
@@ -283,7 +280,7 @@ def _scaled(image: Image.Image, where: str) -> Image.Image:
 
 
 def alpha_of(picture: Image.Image) -> Image.Image | None:
-    """Return the alpha channel; None without one, and where it is opaque everywhere, which says nothing."""
+    """Return the alpha channel; None if there is none, or if it is opaque everywhere."""
     if not picture.has_transparency_data:
         return None
     alpha = picture.convert("RGBA").getchannel("A")
@@ -294,14 +291,14 @@ def alpha_of(picture: Image.Image) -> Image.Image | None:
 
 
 def read_grid(path: Path, size: Size | None = None) -> np.ndarray:
-    """Read the numbers [height, width] of an image of one channel, such as labels or depth, as they are stored.
+    """Read the numbers [height, width] of a single-channel image, such as labels or depth, as they are stored.
 
     Args:
         path: the file.
         size: width and height that it must have; None: any.
 
     Raises:
-        ValueError: no such file, or one of another size or number of channels.
+        ValueError: the file does not exist, or has another size or several channels.
     """
     if size is not None and (got := read_header(path).stored) != size:
         raise ValueError(f"{path}: is {by(got)} pixels, its photograph {by(size)}")

@@ -66,7 +66,7 @@ def processes(count: int, work: Work) -> Iterator[Submit]:
     try:
         yield lambda argument: pool.submit(_run, argument)
     except BrokenProcessPool as error:
-        raise WorkersLost("a process was ended from outside, perhaps for want of memory") from error
+        raise WorkersLost("a process was killed from outside, perhaps because memory ran out") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         listener.stop()
@@ -102,5 +102,5 @@ def _end_with_parent() -> None:
 
 def _run(argument: Any) -> Any:
     if _task is None:
-        raise RuntimeError("a process without a task")
+        raise RuntimeError("this process has no task")
     return _task(argument)

@@ -10,13 +10,13 @@ STREAMS: dict[str, tuple[int, int]] = {
     "psi": (1_000_003, 2),  # everything that a method draws on its way to a psi
     "photographs": (1_000_003, 3),  # the order in which photographs are chosen to train on
     "fine-tuning": (1_000_003, 4),  # new parameters and order of a training on photographs alone
-    # A target's images: the parts of photographs, or what a rendered target draws for each.
+    # A target's images: the division of photographs into parts, or what a rendered target draws for each part.
     "target parts": (1, -1),
     "target val": (2_000_003, 0),
     "target test": (2_000_003, 1),
     "target train": (2_000_003, 2),
-    # Streams of a psi loop, derived from its generator: numbers common to trainings that differ by psi alone, and those
-    # of what reads the first step off the target.
+    # Streams of a psi loop, derived from its generator: random numbers shared by trainings that differ only in psi, and
+    # those of the estimate from the target's boxes, which proposes the first step.
     "common images": (2_000_003, 0),
     "common training": (2_000_003, 1),
     "common first step": (2_000_003, 2),
@@ -31,12 +31,12 @@ def stream(seed: int, name: str, parent: torch.Generator | None = None) -> torch
     """Make the generator of a named stream, on the CPU.
 
     Args:
-        seed: the run's, or a count from 0 where there is a ``parent``.
+        seed: the run's seed, or with a ``parent`` a count from 0.
         name: one of ``STREAMS``.
-        parent: a generator whose own first seed is added.
+        parent: a generator whose initial seed is added.
 
     Raises:
-        ValueError: a name that ``STREAMS`` does not list.
+        ValueError: ``STREAMS`` does not list the name.
     """
     if name not in STREAMS:
         raise ValueError(f"randomness: unknown stream {name!r}, want one of {', '.join(STREAMS)}")

@@ -1,4 +1,4 @@
-"""Ranges of settings, declared once in the types of a class's arguments and checked wherever one is made.
+"""Ranges of settings, declared once in the types of a class's arguments and checked whenever one is constructed.
 
     @validated
     @dataclass(frozen=True)
@@ -9,8 +9,8 @@
         distances: Annotated[tuple[Positive, Positive], Ascending()] = (2.4, 4.0)
 
 ``Loop(radius=2)`` raises "Loop.radius: want more than 0 and at most 1 or null, got 2". The command line checks its YAML
-against the same types before it makes anything, and names the whole key. Numbers are finite, whatever else is declared;
-a condition on several arguments is code in ``__post_init__``, which runs after these checks.
+against the same types before it makes anything, and names the whole key. Numbers must be finite, whatever is declared.
+A condition on several arguments is code in ``__post_init__``, which runs after these checks.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Ascending(BaseMetadata):
 
 @dataclass(frozen=True)
 class Distinct(BaseMetadata):
-    """Marks a sequence of which no value comes twice."""
+    """Marks a sequence in which no value is repeated."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Matching(BaseMetadata):
 
 @dataclass(frozen=True)
 class Misfit:
-    """A value that does not fit its type: where it stands, what is wanted, what was got (None: a key not known)."""
+    """A value that does not fit its type: where it stands, what is wanted, what was got (None: the key is unknown)."""
 
     where: str
     wanted: str
@@ -72,9 +72,15 @@ class Misfit:
 
 
 _Class = TypeVar("_Class", bound=type)
-_SCALARS = (str, int, float, type(None))  # what YAML has; other objects are left to whoever takes them
-_WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): "null"}
-_PLURALS = {int: "whole numbers", float: "numbers", str: "texts"}
+_SCALARS = (str, int, float, type(None))  # what YAML has; other objects are not checked here
+_WORDS = {
+    int: "a whole number",
+    float: "a number",
+    str: "a string",
+    bool: "true or false",
+    type(None): "null",
+}
+_PLURALS = {int: "whole numbers", float: "numbers", str: "strings"}
 
 
 def validated(made: _Class) -> _Class:
@@ -107,7 +113,7 @@ def check(value: Any, hint: Any, where: str) -> None:
     Args:
         value: a scalar, a list or mapping of them, or an object. A mapping with a ``_target_`` stands for what that
             makes: its keys are checked against the arguments of its target.
-        hint: a type, its ranges as ``Annotated`` markers.
+        hint: a type, with ranges as ``Annotated`` markers.
         where: the value's key.
     """
     found = misfit(value, hint, where)
@@ -117,7 +123,7 @@ def check(value: Any, hint: Any, where: str) -> None:
 
 @functools.cache
 def arguments(make: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    """Return what a class or function can be given by name."""
+    """Return the arguments of a class or function by name."""
     return inspect.signature(make).parameters
 
 
@@ -152,7 +158,7 @@ def misfit(value: Any, hint: Any, where: str) -> Misfit | None:
 
 
 def parted(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return a type without its markers, and the markers, those of groups one by one."""
+    """Return a type without its markers, and all its markers, including those inside groups."""
     while typing.get_origin(hint) in (typing.Required, typing.NotRequired):
         (hint,) = typing.get_args(hint)
     if typing.get_origin(hint) is not Annotated:
@@ -165,7 +171,7 @@ def parted(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def words_of(hint: Any) -> str:
-    """Say in words what fits a type, its ranges aside."""
+    """Describe in words what fits a type, apart from its ranges."""
     hint, _ = parted(hint)
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if hint in _WORDS:
@@ -180,7 +186,7 @@ def words_of(hint: Any) -> str:
         element = parted(inner[0])[0] if inner else None
         of = f" of {_PLURALS[element]}" if element in _PLURALS else ""
         return f"a list{of}"
-    return f"a group with a _target_, such as of a {getattr(hint, '__name__', hint)}"
+    return f"a group with a _target_, such as {getattr(hint, '__name__', hint)}"
 
 
 def _misfit_of_node(node: Mapping[str, Any], where: str) -> Misfit | None:
@@ -257,7 +263,7 @@ def _misfit_of_sequence(value: Sequence[Any], hint: Any, where: str) -> Misfit |
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a YAML scalar is of a type."""
+    """Return whether a YAML scalar has a type."""
     if hint is Any or isinstance(hint, TypeVar):
         return True
     if typing.get_origin(hint) is Literal:
@@ -269,7 +275,7 @@ def _fits(value: Any, hint: Any) -> bool:
     kind = typing.get_origin(hint) or hint
     if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
         return False
-    if isinstance(value, str) and issubclass(kind, Collection):  # a text is no list of letters
+    if isinstance(value, str) and issubclass(kind, Collection):  # a string is not a list of letters
         return kind is str
     return isinstance(value, type(None) if kind is None else kind)
 
@@ -308,7 +314,7 @@ def _range_of(marker: Any) -> tuple[str, Callable[[Any], bool]] | None:
         case Ascending():
             return "values that do not decrease", lambda value: list(value) == sorted(value)
         case Distinct():
-            return "no value twice", lambda value: len(set(value)) == len(value)
+            return "no repeated value", lambda value: len(set(value)) == len(value)
         case Matching(test=test, wanted=wanted):
             return wanted, test
     return None

@@ -1,4 +1,4 @@
-"""The frozen dataclasses that travel between packages. They hold tensors and no behaviour beyond selection."""
+"""Frozen dataclasses that pass tensors between packages, and can only select, move and join what they hold."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Rays:
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A pinhole camera without distortion and skew.
+    """A pinhole camera without distortion or skew.
 
-    ``width`` and ``height`` in pixels; ``field_of_view`` in radians is the vertical one of an image of this height
-    about the principal point, 2 atan(height / (2 f_y)). ``aspect`` is f_x / f_y, 1 for square pixels. ``centre`` is the
-    principal point (x, y) in pixels from the image's upper left corner, whose first pixel has its centre at (0.5, 0.5);
-    None: the image's centre. ``neural_sim.cameras.opencv_camera`` makes one from a camera matrix.
+    ``width`` and ``height`` are in pixels. ``field_of_view`` is 2 atan(height / (2 f_y)) in radians, the vertical field
+    of view if the principal point is in the middle. ``aspect`` is f_x / f_y, 1 for square pixels. ``centre`` is the
+    principal point (x, y) in pixels from the image's upper left corner, where the first pixel has its centre at
+    (0.5, 0.5); None: the image's centre. ``neural_sim.cameras.opencv_camera`` makes one from a camera matrix.
     """
 
     width: int
@@ -50,9 +50,9 @@ class PosedViews:
 
     ``images`` are RGBA with straight (not premultiplied) alpha in [0, 1]; ``camera_to_world`` follows OpenGL
     (x right, y up, looking along -z) in the object's normalised frame (unit sphere round the origin).
-    ``light_weights`` are each view's weights over the anchor lights; None: one light for all views, or lights that
-    nobody knows (photographs). ``known`` are the pixels that a photograph shows, None: all; others have alpha 0, which
-    says nothing.
+    ``light_weights`` are each view's weights over the anchor lights; None: one light for all views, or unknown lights
+    (photographs). ``known`` marks the pixels that a photograph shows (None: all); alpha is 0 at the others, where it
+    does not mean background.
     """
 
     images: Float[Tensor, "views height width 4"]
@@ -81,14 +81,14 @@ class PosedViews:
 
 @dataclass(frozen=True)
 class Maps:
-    """One array per rendered map, premultiplied colour and opacity: values, tangents or cotangents."""
+    """The rendered maps, premultiplied colour and opacity: values, tangents or cotangents."""
 
     rgb: Float[Tensor, "n h w 3"]
     opacity: Float[Tensor, "n h w"]
 
     @property
     def rgba(self) -> Float[Tensor, "n h w 4"]:
-        """Both in one array."""
+        """Colour and opacity in one array."""
         return torch.cat([self.rgb, self.opacity[..., None]], -1)
 
 
@@ -96,9 +96,9 @@ class Maps:
 class LabelledImages:
     """Images with boxes. Rows of ``boxes`` whose label is -1 are padding.
 
-    ``images`` in [0, 1]; ``boxes`` are (x0, y0, x1, y1) in pixels, the image spanning [0, width] x [0, height];
-    ``labels`` are class indices from 0. ``bins`` is the pose bin an image was drawn from, or that of each of its boxes
-    (-1: unknown), for reports only.
+    ``images`` are in [0, 1]; ``boxes`` are (x0, y0, x1, y1) in pixels, the image spanning [0, width] x [0, height];
+    ``labels`` are class indices from 0. ``bins`` are the pose bins of images, or of each of their boxes (-1: unknown),
+    for reports only.
     """
 
     images: Float[Tensor, "images 3 height width"]
@@ -126,10 +126,10 @@ class LabelledImages:
     def concatenate(parts: list[LabelledImages]) -> LabelledImages:
         """Join sets of equal image size; boxes are padded to the longest list among them.
 
-        Where one set has a bin for each box all have, those of an image that has one for all its boxes being equal.
+        If any set has a bin for each box, the result has, too: the bin of a whole image is repeated for its boxes.
 
         Raises:
-            ValueError: no sets.
+            ValueError: there are no sets.
         """
         if not parts:
             raise ValueError("concatenate: got no image sets, want at least one")
@@ -154,12 +154,12 @@ class LabelledImages:
 class SceneDraw:
     """Scene parameters V of one object's images, drawn from p_psi (paper, Sec. 3.1, Tool 1).
 
-    ``phi`` and ``rho`` are the two pose angles in radians, ``distance`` the camera's distance from the origin, in the
-    unit of ``radius``, the object's: object radii where that is 1, metres where it is the object's size.
-    ``magnification`` is its focal length in units of the camera's own (None: 1). ``bins`` are the indices of the drawn
-    (or largest relaxed) bins from 0, a column for each binned factor of p_psi. ``weights`` are those of the anchor
-    lights (None: the light is fixed), ``explored`` the Gaussian draws whose projections they are, where they were
-    drawn. The numbers may carry gradients with respect to psi.
+    ``phi`` and ``rho`` are the two pose angles in radians. ``distance`` is the camera's distance from the origin, in
+    the unit of ``radius``, the object's radius: object radii if that is 1, else metres. ``magnification`` is the focal
+    length in units of the camera's (None: 1). ``bins`` are the indices, from 0, of the drawn bins (of relaxed draws,
+    those with the largest weight), with a column for each binned factor of p_psi. ``weights`` are those of the anchor
+    lights (None: the light is fixed); if they are projections of Gaussian draws, ``explored`` are these draws. The
+    numbers may carry gradients with respect to psi.
     """
 
     phi: Float[Tensor, "images"]

@@ -64,7 +64,7 @@ def _cluster(work: Work) -> Iterator[Submit]:
     machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if work.gpus and not any(machine.get("GPU") for machine in machines):
         raise ValueError(
-            "workers=ray: no machine of the cluster has a GPU; want trainer=cpu, or such a machine"
+            "workers=ray: no machine of the cluster has a GPU; want trainer=cpu, or a machine with one"
         )
     cores = max((int(machine.get("CPU", 0)) for machine in machines), default=0)
     place = _Place(mark, os.getcwd(), work.threads, logging.getLogger().getEffectiveLevel(), _code())

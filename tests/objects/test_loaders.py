@@ -156,7 +156,9 @@ def test_meshes_of_other_formats_are_left_out_with_a_count(tmp_path, caplog):
     for name in ("c.fbx", "b/d.USDZ"):
         (tmp_path / name).write_bytes(b"?")
     assert MeshFolder(tmp_path).names() == ["a"]
-    assert f"{tmp_path}: 2 files such as d.USDZ are of a format that is not read, and left out" in caplog.text
+    assert (
+        f"{tmp_path}: 2 files such as d.USDZ have a format that is not read, and are left out" in caplog.text
+    )
 
 
 def test_the_home_folder_is_written_short(tmp_path, ycb_root, monkeypatch):

@@ -52,7 +52,7 @@ def test_of_labels_the_objects_value_counts(tmp_path, mode):
     path = tmp_path / "labels.png"
     picture.save(path)
     assert np.array_equal(read_mask(path, 2), labels == 2)
-    with pytest.raises(ValueError, match=r"holds 4 labels; .*objects\.mask_value says which"):
+    with pytest.raises(ValueError, match=r"holds 4 labels; .*set objects\.mask_value"):
         read_mask(path)
 
 

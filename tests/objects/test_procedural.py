@@ -61,7 +61,7 @@ def test_unknown_names_are_refused_with_the_known_ones():
     with pytest.raises(ValueError, match=r"Procedural\.seed: want at least 0, got -1"):
         Procedural(seed=-1)
     with pytest.raises(
-        ValueError, match=r"Procedural\.names: want 1 or more values and no value twice or null"
+        ValueError, match=r"Procedural\.names: want 1 or more values and no repeated value or null"
     ):
         Procedural(["can", "can"])
 

@@ -54,9 +54,9 @@ def _summed(content):
 @pytest.mark.parametrize(
     ("damage", "why"),
     [
-        (b"half written", "no sum"),
-        (b"", "no sum"),
-        (b"\x80\x04N.", "no sum"),
+        (b"half written", "no checksum"),
+        (b"", "no checksum"),
+        (b"\x80\x04N.", "no checksum"),
         (_saved({"value": 1, "seconds": 1.0}), "no checksum, like entries of older versions"),
         (_summed([1]), "holds a list"),
         (_summed(3.0), "holds a float"),

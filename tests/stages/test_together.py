@@ -61,5 +61,5 @@ def test_an_error_is_that_of_the_stage(results):
 
 def test_a_process_that_is_killed_costs_no_more_than_its_result(results, caplog):
     make_together(results, [Number(666), Number(2)], by=2)
-    assert "a process was ended from outside" in caplog.text
+    assert "a process was killed from outside" in caplog.text
     assert results(Number(2))["total"] == 2
