@@ -1,4 +1,4 @@
-"""Run the project in environments of its own: ``nox -s demo``, for example; ``nox -l`` lists the sessions."""
+"""Run the project in its own environments, for example ``nox -s demo``; ``nox -l`` lists the sessions."""
 
 import nox
 

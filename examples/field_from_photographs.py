@@ -1,4 +1,4 @@
-"""Fit one radiance field to photographs, score it on held-out ones, and render it from all around.
+"""Fit one radiance field to photographs, score it on held-out ones, and render it from all sides.
 
 The folder contains photographs with cameras (``transforms.json`` or a COLMAP model) and masks. If cameras or masks are
 missing, have them computed:

@@ -50,7 +50,7 @@ class PaintedCube(RenderedSubject):
     colours: Tensor  # [6, 3], colours of the faces -x, -y, -z, +x, +y, +z
 
     def maps(self, camera: PinholeCamera, camera_to_world: Tensor, weights: Tensor | None = None) -> Maps:
-        """Intersect the ray of every pixel with the cube; see :meth:`RenderedSubject.maps`."""
+        """Intersect the ray of every pixel with the cube; see ``RenderedSubject.maps``."""
         bundle = rays(camera, camera_to_world)
         half = 1.0 / math.sqrt(3.0)
         near = (-half * bundle.directions.sign() - bundle.origins) / bundle.directions
@@ -108,9 +108,8 @@ def main() -> None:
     )
     inputs = LoopInputs(detector, started, validation)
     inner = InnerLoop.prepare(scene, inputs, settings, training, generator)
-    solver = AdjointSolver(
-        ConjugateGradient(), LanczosDamping()
-    )  # not used: the default derivative solves no linear system
+    # The solver is not used: the default derivative solves no linear system.
+    solver = AdjointSolver(ConjugateGradient(), LanczosDamping())
     first = WhatTheTargetShows(reading)
     loop = SimulatorModule(inner, initial, StratifiedEstimator(probes_per_bin=16), solver, generator, first)
     learned = learn_psi(loop)
