@@ -80,7 +80,7 @@ def test_a_tracking_store_that_fails_costs_a_line(context, capsys, caplog):
 def test_a_full_disk_is_told_with_the_folder_that_was_written_to(context):
     with (
         pytest.raises(
-            UserError, match=rf"^mine: writing to {context.folder}: No space left on device; .* is kept$"
+            UserError, match=rf"^mine: {context.folder} cannot be written to: No space .* are kept$"
         ),
         context.running("mine"),
     ):
