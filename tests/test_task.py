@@ -58,11 +58,14 @@ def test_the_command_line_goes_before_the_task():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["task=classification", "detector=tiny"], "task=classification and a detector that is scored by AP"),
-        (["detector=classifier"], "task=detection and a detector that is scored by accuracy"),
+        (
+            ["task=classification", "detector=tiny"],
+            "task=classification does not go with a detector that is scored by AP",
+        ),
+        (["detector=classifier"], "task=detection does not go with a detector that is scored by accuracy"),
         (
             ["task=classification", "+variant=paper"],
-            "task=classification and a detector that is scored by AP",
+            "task=classification does not go with a detector that is scored by AP",
         ),
         (["outer/objective=smooth_accuracy"], "outer/objective: want smooth_ap or loss for task=detection"),
         (
