@@ -158,12 +158,12 @@ REFUSED: dict[str, tuple[Callable[[Path], None], str]] = {
         "cx and cy in pixels, got the frac",
     ),
     "transposed": (spoilt(np.transpose), r"transform_matrix: want 0, 0, 0, 1 as its last row, .*transposed"),
-    "scaled": (spoilt(lambda pose: pose @ np.diag([2.0, 2.0, 2.0, 1.0])), r"no rotation .*determinant 8"),
-    "one place": (spoilt(lambda pose: np.array(poses()[0])), "its 6 cameras all stand at"),
+    "scaled": (spoilt(lambda pose: pose @ np.diag([2.0, 2.0, 2.0, 1.0])), r"not a rotation .*determinant 8"),
+    "one place": (spoilt(lambda pose: np.array(poses()[0])), "its 6 cameras are all at"),
     "twice": (twice, r"two of its poses are of .*frame_00000\.png"),
     "no points": (
         lambda home: colmap_text(home, change=without_points),
-        "want two lines an image, .*after the one of",
+        "want two lines for each image, .*is followed by",
     ),
     "one name": (lambda home: colmap_text(home, change=one_name), r"two of its poses are of .*000\.png"),
     "no turn": (lambda home: colmap_text(home, change=no_turn), "want a quaternion of length 1, got 0"),
@@ -182,7 +182,7 @@ def test_what_would_be_read_wrong_is_refused(tmp_path: Path, kind: str) -> None:
 def test_poses_of_other_axes_are_refused_where_the_object_is_placed(tmp_path: Path, change: Any) -> None:
     spoilt(change)(tmp_path / "thing")
     with pytest.raises(
-        ValueError, match=r"thing.*(share no space; check masks, poses and axes|up has no direction)"
+        ValueError, match=r"thing.*(visual hull .* is empty; check masks, poses and axes|up has no direction)"
     ):
         Photos(tmp_path).placement("thing")
 
@@ -193,6 +193,6 @@ def test_masks_of_one_name_in_several_folders_are_refused(tmp_path: Path) -> Non
     mask.parent.mkdir()
     Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
     with pytest.raises(
-        ValueError, match=r"masks/000\.png: is by its name the mask of .*cam0/000\.png and of .*cam1"
+        ValueError, match=r"masks/000\.png: by its name is the mask of both .*cam0/000\.png and .*cam1"
     ):
         Photos(tmp_path)

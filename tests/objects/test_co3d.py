@@ -123,17 +123,17 @@ def _set(key, value):
     ("change", "message"),
     [
         (_without("R"), r"\[1\]\.viewpoint\.R: want 3 x 3 finite numbers, got None"),
-        (_set("R", np.ones((3, 3)).tolist()), r"\[1\]\.viewpoint\.R and T: .* are no rotation"),
+        (_set("R", np.ones((3, 3)).tolist()), r"\[1\]\.viewpoint\.R and T: .* are not a rotation"),
         (_set("T", [0.0, 1.0]), r"\[1\]\.viewpoint\.T: want 3 finite numbers"),
         (_set("focal_length", "wide"), r"\[1\]\.viewpoint\.focal_length: want 2 numbers, got 'wide'"),
         (_set("focal_length", [-1.0, 1.0]), r"\[1\]\.viewpoint\.focal_length: want positive focal lengths"),
         (_set("intrinsics_format", "pixels"), r"\[1\]\.viewpoint\.intrinsics_format: want one of ndc_.*'pixels'"),
         (lambda held: held.pop("viewpoint"), r"\[1\]\.viewpoint: want a camera, got None"),
-        (lambda held: held.pop("image"), r"\[1\]\.image\.path: want a file's path"),
+        (lambda held: held.pop("image"), r"\[1\]\.image\.path: want a file's path relative to the root"),
         (lambda held: held["image"].update(path="mug/none.png"), r"\[1\]\.image\.path: no such file: .*none\.png"),
         (lambda held: held["image"].update(size=[10, 20]), r"\[1\]\.image\.size: want height and width .*\[150, 200\]"),
         (lambda held: held.update(mask={"path": "mug/none.png"}), r"\[1\]\.mask\.path: no such file"),
-        (lambda held: held.pop("sequence_name"), r"\[1\]\.sequence_name: want a text"),
+        (lambda held: held.pop("sequence_name"), r"\[1\]\.sequence_name: want a string"),
     ],
 )  # fmt: skip
 def test_bad_annotations_are_refused_with_file_and_key(tmp_path, change, message):
@@ -148,7 +148,7 @@ def test_bad_annotations_are_refused_with_file_and_key(tmp_path, change, message
 
 def test_files_that_cannot_be_read_are_refused(tmp_path):
     (tmp_path / "mug").mkdir()
-    with pytest.raises(ValueError, match=r"holds no folder of a category with frame_annotations\.jgz"):
+    with pytest.raises(ValueError, match=r"holds no category folder with frame_annotations\.jgz"):
         Co3d(tmp_path)
     path = tmp_path / "mug" / "frame_annotations.jgz"
     for content in (b"[]", gzip.compress(b"{"), gzip.compress(json.dumps([{}]).encode())[:-4]):
@@ -156,7 +156,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
         with pytest.raises(ValueError, match=r"frame_annotations\.jgz: not readable as gzipped JSON"):
             Co3d(tmp_path)
     write_jgz(path, [])
-    with pytest.raises(ValueError, match=r"want a list of annotations, as CO3D has it"):
+    with pytest.raises(ValueError, match=r"want a list of annotations, as in CO3D"):
         Co3d(tmp_path)
 
 

@@ -195,7 +195,7 @@ def test_gltf_text_with_buffers_and_pictures_beside_it(tmp_path):
     assert part.texture.pixels[0, 0].tolist() == list(RED)
     assert sorted(file.name for file in references(path)) == ["my tex.png", "uv.bin"]
     (tmp_path / "uv.bin").unlink()
-    with pytest.raises(ValueError, match=r"m\.gltf: .*names 'uv\.bin', which is not there"):
+    with pytest.raises(ValueError, match=r"m\.gltf: .*refers to 'uv\.bin', which does not exist"):
         references(path)
 
 
@@ -204,8 +204,8 @@ def test_gltf_text_with_buffers_and_pictures_beside_it(tmp_path):
     [
         ({"extensionsRequired": ["EXT_meshopt_compression"]}, "requires EXT_meshopt_compression"),
         ({"asset": {"version": "1.0"}}, "want glTF 2.0, got version '1.0'"),
-        ({"nodes": [{"mesh": 0, "children": [0]}]}, "below itself"),
-        ({"nodes": [{"mesh": 0, "rotation": [0, 0, 0, 0]}]}, "rotation has no length"),
+        ({"nodes": [{"mesh": 0, "children": [0]}]}, "its own ancestor"),
+        ({"nodes": [{"mesh": 0, "rotation": [0, 0, 0, 0]}]}, "rotation has length 0"),
         ({"nodes": [{"mesh": 7}]}, "IndexError"),
         ({"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]}, "EXT_mesh_gpu_instancing"),
         ({"bufferViews": [{"buffer": 0, "byteLength": 999}]}, "wants bytes 0 to 999"),

@@ -91,9 +91,9 @@ def test_a_command_makes_a_mask_of_each_photograph(tmp_path, photographs):
     [
         ("raise SystemExit('no model')", r"ended with status 1: no model"),
         (BRIGHT.replace("sorted(given.iterdir())", "sorted(given.iterdir())[1:]"),
-         r"wrote 0 masks named 00000\*, want one, that of .*photo 0\.png; it wrote 2 pictures"),
+         r"wrote 0 masks named 00000\*, want one, for .*photo 0\.png; it wrote 2 pictures"),
         (BRIGHT.replace('convert("L")', 'convert("L").resize((8, 6))'),
-         r"the mask has 8 x 6 pixels, its image .*photo 0\.png 16 x 12"),
+         r"the mask has 8 x 6 pixels, but its image .*photo 0\.png has 16 x 12"),
     ],
 )  # fmt: skip
 def test_what_a_command_fails_at_is_said(tmp_path, photographs, text, message):

@@ -91,16 +91,16 @@ def test_a_name_that_several_files_have_is_refused(tmp_path):
     ("lines", "mtl", "reason"),
     [
         ("usemtl b\nf 1 2 3", "newmtl a\nKd 1 0 0", r"usemtl 'b' is in no material library; m\.mtl has 'a'"),
-        ("usemtl a\nf 1 2 3", "newmtl a\nmap_Kd gone.png", r"m\.mtl, line 2: the texture 'gone\.png' is neither"),
+        ("usemtl a\nf 1 2 3", "newmtl a\nmap_Kd gone.png", r"m\.mtl, line 2: the texture 'gone\.png' was not"),
         ("usemtl a\nf 1 2 3", "newmtl a\nKd red", r"m\.mtl, line 2: want Kd with three numbers, got 'red'"),
         ("usemtl a\nf 1 2 3", "newmtl a\nmap_Kd -zoom 2 a.png", r"unknown option -zoom"),
-        ("f 1 2 4", None, r"names vertex 4, there are 3"),
-        ("f 1/9 2/1 3/1", None, r"names vt 9, there are 3"),
-        ("f 1 2 0", None, r"line 8: '0' is no corner"),
+        ("f 1 2 4", None, r"refers to vertex 4, but there are 3"),
+        ("f 1/9 2/1 3/1", None, r"refers to vt 9, but there are 3"),
+        ("f 1 2 0", None, r"line 8: '0' is not a corner"),
         ("f 1 2", None, r"line 8: want a face of three corners"),
-        ("f 1 2 -9", None, r"line 8: '-9' is no corner"),
-        ("f a b c", None, r"line 8: 'a' is no corner"),
-        ("v 1 2 x\nf 1 2 3", None, r"a v has something else than numbers"),
+        ("f 1 2 -9", None, r"line 8: '-9' is not a corner"),
+        ("f a b c", None, r"line 8: 'a' is not a corner"),
+        ("v 1 2 x\nf 1 2 3", None, r"a v line has something other than numbers"),
         ("v 1 2\nf 1 2 3", None, r"want 3 numbers in every v"),
         ("", None, r"holds no triangles"),
     ],
@@ -117,7 +117,7 @@ def test_what_an_obj_leaves_open_is_said(tmp_path, caplog):
     text = f"mtllib gone.mtl\nmtllib m.mtl\n{TRIANGLE}usemtl a\nf 1 2 3\nusemtl None\nf 1 2 3\n"
     plain, none = read_obj(obj(tmp_path, text, "newmtl a\nKd 0 1 0\nmap_Kd a.png\n"))
     assert plain.colours[0].tolist() == [0, 1, 0] and none.colours[0] == pytest.approx(160 / 255)
-    assert "mtllib gone.mtl is not there" in caplog.text and "painted grey" in caplog.text
+    assert "mtllib gone.mtl does not exist" in caplog.text and "painted grey" in caplog.text
     assert "1 faces of material 'a' have no coordinates in its texture a.png" in caplog.text
 
 
@@ -202,11 +202,11 @@ def test_binary_ply_of_triangles_and_quads(tmp_path, order):
 
 def test_a_ply_that_ends_early_or_names_no_vertex_is_refused(tmp_path):
     path = ply(tmp_path / "m.ply", [*XYZ, *FACES], [*QUAD, "3 0 1 2"])
-    with pytest.raises(ValueError, match=r"m\.ply: .*2 of face do not fit"):
+    with pytest.raises(ValueError, match=r"m\.ply: .*cut off: want 2 rows of face"):
         load_file(path, "m", "")
     ply(path, [*XYZ, *FACES], [*QUAD, "3 0 1 2", "3 0 1 4"])
-    with pytest.raises(ValueError, match=r"names vertex 4 or 0, there are 4"):
+    with pytest.raises(ValueError, match=r"refers to vertex 4 or 0, but there are 4"):
         load_file(path, "m", "")
     ply(path, [*XYZ, *FACES], [*QUAD, "3 0 1 2", "3 0 1 3"], ("gone.png",))
-    with pytest.raises(ValueError, match=r"m\.ply: .*'gone\.png' is neither there"):
+    with pytest.raises(ValueError, match=r"m\.ply: .*'gone\.png' was not found"):
         references(path)

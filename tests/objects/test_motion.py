@@ -154,7 +154,7 @@ def test_photographs_without_a_camera_are_named(found, caplog):
     assert found.missing == ("images/20.jpg", "images/21.jpg")
     with caplog.at_level(logging.INFO):
         found.tell()
-    assert "cameras of 14 of 16 photographs found" in caplog.text
+    assert "found the cameras of 14 of 16 photographs" in caplog.text
     assert (
         "no camera found for 2 photographs, which are left out: images/20.jpg, images/21.jpg" in caplog.text
     )
@@ -177,7 +177,8 @@ def test_photographs_without_overlap_are_refused(tmp_path):
     for number in range(8):
         noise(tmp_path / f"{number}.png")
     refused(
-        tmp_path, r"no two of 8 photographs show enough of one place.*two thirds of what the one before shows"
+        tmp_path,
+        r"no two of the 8 photographs have enough in common.*two thirds of what the one before shows",
     )
 
 
@@ -190,7 +191,7 @@ def test_photographs_from_one_place_are_refused(tmp_path):
         )
         here[:3, :3] = pose[:3, :3] @ turn
         save(photograph(here), tmp_path / f"{number}.png")
-    refused(tmp_path, r"taken from (nearly )?one place.*walk round the object")
+    refused(tmp_path, r"taken from (nearly )?one place.*walk around the object")
 
 
 # --- turntables ---

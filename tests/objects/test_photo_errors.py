@@ -81,11 +81,11 @@ def bad_up(document, home):
     ("change", "message"),
     [
         (no_pose, r"transforms\.json: frames\[2\] \(images/002\.png\): has no pose; want a transform_matrix"),
-        (mirrored, r"frames\[2\].*transform_matrix.*no rotation.*determinant -1"),
-        (stretched, r"frames\[2\].*transform_matrix.*no rotation"),
+        (mirrored, r"frames\[2\].*transform_matrix.*not a rotation.*determinant -1"),
+        (stretched, r"frames\[2\].*transform_matrix.*not a rotation"),
         (not_numbers, r"frames\[2\].*want a matrix of 4 x 4 numbers, got 'identity'"),
-        (no_images, r"transforms\.json: none of its 16 photographs has a file, such as images/000\.png"),
-        (other_size, r"frames\[2\].*has 100 x 75 pixels, its intrinsics w and h say 200 x 150"),
+        (no_images, r"transforms\.json: all of its 16 photographs are missing, such as images/000\.png"),
+        (other_size, r"frames\[2\].*has 100 x 75 pixels, but its intrinsics w and h say 200 x 150"),
         (other_model, r"frames\[0\].*camera_model: want one of .*got 'THIN_PRISM_FISHEYE'"),
         (no_focal_length, r"frames\[0\].*want intrinsics fl_x or camera_angle_x"),
         (no_frames, r"transforms\.json: want a list 'frames' with at least one frame"),
@@ -97,19 +97,18 @@ def test_what_is_wrong_in_a_file_is_named(made, tmp_path, change, message):
         Photos(broken(made, tmp_path, change))
 
 
-def test_listed_photographs_without_a_file_are_left_out_with_a_count(made, tmp_path, caplog):
+def test_listed_photographs_that_are_missing_are_left_out_with_a_count(made, tmp_path, caplog):
     photos = Photos(broken(made, tmp_path / "json", no_image))
     assert len(photos.captures["can"].frames) == 15
     assert (
-        "transforms.json: 1 of 16 photographs have no file and are left out, such as images/002.png"
-        in caplog.text
+        "transforms.json: 1 of 16 photographs are missing and left out, such as images/002.png" in caplog.text
     )
     home = tmp_path / "model" / "can"
     shutil.copytree(made["colmap_text"].folder, home)
     for name in ("003.png", "007.png"):
         (home / "images" / name).unlink()
     assert len(Photos(home.parent).captures["can"].frames) == 14
-    assert "sparse/0: 2 of 16 photographs have no file and are left out, such as" in caplog.text
+    assert "sparse/0: 2 of 16 photographs are missing and left out, such as" in caplog.text
 
 
 def test_of_several_models_the_one_with_the_most_photographs_is_taken(made, tmp_path, caplog):
@@ -120,8 +119,7 @@ def test_of_several_models_the_one_with_the_most_photographs_is_taken(made, tmp_
     (home / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:6]) + "\n")
     assert len(Photos(tmp_path).captures["can"].frames) == 16
     assert (
-        "sparse/1: of 2 models, the one with the most photographs (16) is taken; left out: 0 (3)"
-        in caplog.text
+        "sparse/1: used because it has the most photographs (16) of 2 models; left out: 0 (3)" in caplog.text
     )
 
 
@@ -140,16 +138,14 @@ def test_what_is_wrong_with_masks_is_named(made, tmp_path):
         Image.new("L", (20, 15), 255).save(home / "masks" / "002.png")
 
     with pytest.raises(
-        ValueError, match=r"masks/002\.png: the mask has 20 x 15 pixels, its image .*200 x 150"
+        ValueError, match=r"masks/002\.png: the mask has 20 x 15 pixels, but its image .* has 200 x 150"
     ):
         Photos(broken(made, tmp_path / "small", small)).placement("can")
 
     def gone(document, home):
         (home / "masks" / "002.png").unlink()
 
-    with pytest.raises(
-        ValueError, match=r"002\.png: nothing says which of its pixels are the object's.*masks=scene"
-    ):
+    with pytest.raises(ValueError, match=r"002\.png: has no mask of the object; .*masks=scene"):
         Photos(broken(made, tmp_path / "gone", gone)).placement("can")
 
     def empty(document, home):

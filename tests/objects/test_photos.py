@@ -122,7 +122,7 @@ def test_up_is_estimated_and_said(made, caplog):
     truth = made["colmap_text"]
     with caplog.at_level(logging.INFO):
         estimated = Photos(truth.folder.parent).placement("can").to_object
-    assert "up is taken to be" in caplog.text and "objects.up says another" in caplog.text
+    assert "up is assumed to be" in caplog.text and "objects.up sets another" in caplog.text
     given = Photos(truth.folder.parent, up="-y").placement("can").to_object
     up = [matrix[2, :3] / np.linalg.norm(matrix[2, :3]) for matrix in (estimated, given)]
     np.testing.assert_allclose(up[1], [0.0, -1.0, 0.0], atol=1e-9)

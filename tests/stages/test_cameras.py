@@ -67,7 +67,10 @@ def test_cameras_are_found_once_and_told_of_again(alone, tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         capture_ = placed(alone, tmp_path, Known()).captures["can"]
     assert Known.searches == [[True] * 12]
-    assert "can: cameras of 11 of 12 photographs found from 321 points, mean error 0.40 pixels" in caplog.text
+    assert (
+        "can: found the cameras of 11 of 12 photographs, with 321 points and a mean error of 0.40"
+        in caplog.text
+    )
     assert "left out: images/002.png" in caplog.text
     kept = [frame for number, frame in enumerate(Known.truth.frames) if number != 2]
     assert [frame.image.name for frame in capture_.frames] == [frame.image.name for frame in kept]

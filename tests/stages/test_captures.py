@@ -98,7 +98,7 @@ def test_meshes_beside_photographs_are_further_classes(root, tmp_path):
         results(graph.scene).training_set(graph.psi("initial"), 2, torch.Generator().manual_seed(0)).images
     )
     assert {int(label) for label in images.labels[images.present]} == {0, 1, 2}
-    with pytest.raises(UserError, match=r"objects\.beside: 'ball' names an object of photographs, too"):
+    with pytest.raises(UserError, match=r"objects\.beside: 'ball' is also the name of a photographed object"):
         capture(tmp_path / "twice", "ball", count=4, item=Procedural(["can"]).load()[0])
         started(tmp_path / "twice", tmp_path, *beside)
 

@@ -1,1 +1,1 @@
-"""Objects: procedural meshes, YCB layout, BOP models, any folder of meshes, photographs with or without cameras."""
+"""Sources of objects: procedural meshes, YCB and BOP layouts, any folder of meshes, and photographs."""

@@ -24,7 +24,7 @@ from neural_sim.pictures import (
 
 FOLDER = "images"
 FILM_DIAGONAL = 43.27
-"""Width in millimetres of the 36 x 24 mm film to which EXIF's equivalent focal length refers."""
+"""Diagonal in millimetres of the 36 x 24 mm film to which EXIF's equivalent focal length refers."""
 UP = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """The upright picture's up direction in the stored picture (x to the right, y up), by EXIF orientation."""
 
@@ -55,19 +55,19 @@ class Shot:
 
 @dataclass(frozen=True)
 class Album:
-    """The photographs of an object, by name. Names are relative to ``folder``."""
+    """The photographs of one object, in the order of their file names."""
 
     name: str
     folder: Path
     shots: tuple[Shot, ...]
 
     def called(self, shot: Shot) -> str:
-        """Return a photograph's name as used in messages and results."""
+        """Return a photograph's path relative to ``folder``, its name in messages and results."""
         return shot.image.relative_to(self.folder).as_posix()
 
 
 def pictures_of(folder: Path) -> list[Path]:
-    """Return the photographs in a capture's folder: those in its folder ``images`` if it exists, otherwise its own."""
+    """Return a capture's photographs: those in its subfolder ``images`` or, without one, in its folder itself."""
     if (folder / FOLDER).is_dir():
         return picture_files(folder / FOLDER)
     own = sorted(
@@ -99,7 +99,7 @@ def _files(folder: Path) -> list[Path]:
 
 def _without_pictures(strange: Sequence[str]) -> str:
     return f"holds no photographs ({', '.join(PHOTO_SUFFIXES)})" + (
-        "; convert them to JPEG" if strange else ""
+        "; convert its other pictures to JPEG" if strange else ""
     )
 
 

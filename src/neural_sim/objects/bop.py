@@ -30,7 +30,7 @@ class BOP(MeshFiles):
         names: objects as 'obj_000001', '000001', '1' or 1; None: all.
 
     Raises:
-        ValueError: the folder has no ``obj_*.ply``, or a name is unknown.
+        ValueError: the folder does not exist or has no ``obj_*.ply``, or a name is unknown.
     """
 
     def __init__(self, root: str | Path, names: Annotated[list[str | int], MinLen(1)] | None = None) -> None:
@@ -49,7 +49,8 @@ class BOP(MeshFiles):
         """Load the objects, normalised, in the order of ``names``; their transforms give metres.
 
         Raises:
-            ValueError: a mesh's extent does not agree with its diameter in models_info.json in any unit.
+            ValueError: a file cannot be read, or a mesh does not have the diameter in models_info.json, neither in
+                millimetres nor in metres.
         """
         diameters, digests = self._diameters(), self.digests()
         items = []
@@ -60,9 +61,9 @@ class BOP(MeshFiles):
         return items
 
     def _diameters(self) -> dict[str, float]:
-        """Read diameters in millimetres by object number from models_info.json; if it is missing, warn, return none."""
+        """Read diameters in millimetres, by object number, from models_info.json; without it, warn and return none."""
         if not self._info.is_file():
-            log.warning("%s is missing: the models are taken to be in millimetres, unchecked", self._info)
+            log.warning("%s is missing: the models are assumed to be in millimetres", self._info)
             return {}
         try:
             info = read_json(self._info)
@@ -78,18 +79,18 @@ class BOP(MeshFiles):
         if abs(measured / diameter - 1.0) <= DIAMETER_TOLERANCE:
             return item
         if abs(measured / MILLIMETRE / diameter - 1.0) <= DIAMETER_TOLERANCE:
-            log.warning("%s is in metres, not millimetres, by the diameter in %s", path, self._info)
+            log.warning("%s is in metres, not millimetres, according to its diameter in %s", path, self._info)
             transform = item.transform.copy()
             transform[:3] /= MILLIMETRE
             return ObjectMesh(item.name, item.mesh, transform, item.digest)
         raise ValueError(
-            f"{path}: measures {measured:.4g} mm across where {self._info.name} says {diameter:.4g}; "
+            f"{path}: measures {measured:.4g} mm across, but {self._info.name} says {diameter:.4g}; "
             "want both in millimetres"
         )
 
 
 def _diameter(item: ObjectMesh) -> float:
-    """Return the largest distance between two vertices, in metres; vertices of the convex hull attain it."""
+    """Return the largest distance between two vertices, in metres; both lie on the convex hull."""
     try:
         points = np.asarray(item.mesh.convex_hull.vertices)
     except (ValueError, RuntimeError):  # flat meshes have no hull; scipy's QhullError is a RuntimeError

@@ -18,23 +18,24 @@ _log = logging.getLogger(__name__)
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R R^T from the identity: files round to six digits, and pose optimisers drift."""
 WIDEST = 3.0
-"""Tangent of the largest angle off the axis at which a perspective lens's distortion is checked."""
+"""Tangent of the angle off the axis up to which the distortion of a perspective lens is checked."""
 FARTHEST = 1e3
 """Tangent of the largest angle off the axis that a pixel of a perspective lens may have."""
 FOCAL_LENGTHS = (0.05, 1000.0)
-"""Smallest and largest focal length, in units of the image's longer side: 170 degrees, and a telescope."""
+"""Smallest and largest focal length, in units of the image's longer side: a view of 170 degrees, and a telescope."""
 BISECTIONS = 64
 REPETITIONS = 12
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera with OpenCV's distortion.
+    """The intrinsics of a camera, with OpenCV's distortion.
 
     Lengths are in pixels; the principal point is measured from the image's upper left corner (the first pixel's centre
     is (0.5, 0.5), as in COLMAP and nerfstudio). A point (x, y) of the plane at distance 1, with radius r, is scaled by
     (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + divisor[0] r^2 + ...), then shifted by the ``tangential`` p1 and
-    p2. With ``fisheye``, r is the angle off the axis, and there is no tangential term.
+    p2. With ``fisheye``, the point is first moved to a radius equal to its angle off the axis, which then is r, and
+    there is no tangential term.
 
     Raises:
         ValueError: a size or focal length is not positive, a number is not finite, or a length is not in pixels.
@@ -54,7 +55,7 @@ class Lens:
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.radial, *self.divisor, *self.tangential)
         if self.width < 1 or self.height < 1 or not np.isfinite(numbers).all():
-            raise ValueError(f"want a size of pixels and finite numbers, got {self}")
+            raise ValueError(f"want a size in pixels and finite numbers, got {self}")
         if not (self.fx > 0.0 and self.fy > 0.0):
             raise ValueError(f"want positive focal lengths, got {self.fx} and {self.fy}")
         low, high = (factor * max(self.width, self.height) for factor in FOCAL_LENGTHS)
@@ -67,7 +68,7 @@ class Lens:
             raise ValueError(f"want cx and cy in pixels, got the fractions {self.cx:g} and {self.cy:g}")
 
     def resized(self, width: int, height: int) -> Lens:
-        """Return the lens for the same photograph in another size."""
+        """Return the lens for the same photograph at another size."""
         across, down = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=across * self.fx, fy=down * self.fy, cx=across * self.cx,
@@ -75,10 +76,10 @@ class Lens:
         )  # fmt: skip
 
     def project(self, local: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Return the pixels (x, y) of points in the camera's OpenGL frame, and which of them are visible.
+        """Return the pixels (x, y) of points in the camera's OpenGL frame, and which of the points the lens can see.
 
-        Points behind the camera are not visible, nor are points so far off the axis that the distortion's polynomial
-        stops increasing.
+        It sees no points behind the camera, and none so far off the axis that the distorted radius no longer increases.
+        Pixels may lie outside the image.
         """
         depth = -local[..., 2]
         ahead = depth > 1e-9
@@ -97,8 +98,8 @@ class Lens:
     def directions(self, pixel: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
         """Invert ``project``: return unit directions in the camera's OpenGL frame, and which pixels have one.
 
-        The radius is found by bisection, which no distortion can mislead; the small tangential term by fixed-point
-        iteration.
+        The radius is found by bisection, which converges whatever the distortion. The small tangential term is removed
+        by fixed-point iteration.
         """
         target = (pixel - pixel.new_tensor([self.cx, self.cy])) / pixel.new_tensor([self.fx, self.fy])
         reach = min(self._reach(), 0.5 * np.pi if self.fisheye else FARTHEST)
@@ -149,7 +150,7 @@ def _polynomial(coefficients: tuple[float, ...], square: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Frame:
-    """One photograph.
+    """One photograph with its camera.
 
     ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z), in the capture's frame and unit. ``mask`` is
     a separate image file; ``test`` marks frames of the capture's own test set.
@@ -166,11 +167,11 @@ class Frame:
 class Capture:
     """The photographs of an object.
 
-    ``source`` is the file or folder with their cameras; ``files`` are all files that were read; ``up`` is the world's
-    up direction in the capture's frame, None if the source does not give it.
+    ``source`` is the file or folder with their cameras; ``files`` are all files that the capture consists of; ``up`` is
+    the world's up direction in the capture's frame, None if the source does not give it.
 
     Raises:
-        ValueError: a photograph is listed twice, or all cameras are at one place.
+        ValueError: a photograph is listed twice, or all cameras are in the same place.
     """
 
     name: str
@@ -185,28 +186,28 @@ class Capture:
             before = first.setdefault(os.path.abspath(frame.image), number)
             if before != number:
                 raise ValueError(
-                    f"{self.source}: two of its poses are of {frame.image}: which one holds is not known"
+                    f"{self.source}: two of its poses are of {frame.image}; want one for each photograph"
                 )
         places = np.array([frame.camera_to_world[:3, 3] for frame in self.frames])
         if len(places) > 1 and (places == places[0]).all():
             raise ValueError(
-                f"{self.source}: its {len(places)} cameras all stand at {places[0].tolist()}, want them round it"
+                f"{self.source}: its {len(places)} cameras are all at {places[0].tolist()}, want them around the object"
             )
 
 
 def say_missing(source: Path, missing: Sequence[str], listed: int) -> None:
-    """Warn about listed photographs that have no file and are left out.
+    """Warn about listed photographs that are missing and left out.
 
     Raises:
-        ValueError: none of the ``listed`` photographs has a file.
+        ValueError: all ``listed`` photographs are missing.
     """
     if missing and len(missing) == listed:
         raise ValueError(
-            f"{source}: none of its {listed} photographs has a file, such as {missing[0]}; want them where it says"
+            f"{source}: all of its {listed} photographs are missing, such as {missing[0]}; put them where it says"
         )
     if missing:
         _log.warning(
-            "%s: %d of %d photographs have no file and are left out, such as %s",
+            "%s: %d of %d photographs are missing and left out, such as %s",
             source, len(missing), listed, missing[0],
         )  # fmt: skip
 
@@ -215,8 +216,8 @@ def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
     """Check a camera-to-world matrix of 3 or 4 rows, and return it with 4.
 
     Raises:
-        ValueError: the matrix has another shape or entries that are not finite, or its first three rows and columns are
-            not a rotation.
+        ValueError: the matrix has another shape or entries that are not finite, its first three rows and columns are
+            not a rotation, or its fourth row is not 0, 0, 0, 1.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
@@ -230,7 +231,7 @@ def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
         raise ValueError(
-            f"{where}: its first three rows and columns are no rotation (R R^T is {error:.2g} from the identity, "
+            f"{where}: its first three rows and columns are not a rotation (R R^T is {error:.2g} off the identity, "
             f"determinant {np.linalg.det(rotation):.3g})"
         )
     if len(pose) == 4 and not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=ROTATION_TOLERANCE):

@@ -67,12 +67,14 @@ class Co3d(Photos):
         )
         strange = sorted(set(self.sequences) - set(self.names()))
         if strange:
-            raise ValueError(f"objects.sequences: {strange} are not objects, these are {self.names()}")
+            raise ValueError(
+                f"objects.sequences: {strange} are not objects, want some of {', '.join(self.names())}"
+            )
 
     def _found(self) -> dict[str, Path]:
         found = {p.name: p for p in sorted(self.root.iterdir()) if (p / FRAMES).is_file()}
         if not found:
-            raise ValueError(f"objects.root: {self.root} holds no folder of a category with {FRAMES}")
+            raise ValueError(f"objects.root: {self.root} holds no category folder with {FRAMES}")
         return found
 
     def _read(self, name: str) -> Capture:
@@ -86,7 +88,7 @@ class Co3d(Photos):
         return Capture(name, frames, source, (source, *listed))
 
     def _sequence(self, name: str, counts: Counter[str]) -> str:
-        """Choose the sequence of a category; ``counts`` has the number of frames of each of its sequences."""
+        """Choose the sequence of a category; ``counts`` is the number of frames in each of its sequences."""
         wanted = self.sequences.get(name)
         if wanted is not None:
             if wanted not in counts:
@@ -116,10 +118,10 @@ def _entries(path: Path, key: str) -> list[dict[str, Any]]:
     except (OSError, EOFError, ValueError) as error:
         raise ValueError(f"{path}: not readable as gzipped JSON ({error})") from error
     if not isinstance(entries, list) or not entries:
-        raise ValueError(f"{path}: want a list of annotations, as CO3D has it")
+        raise ValueError(f"{path}: want a list of annotations, as in CO3D")
     for number, entry in enumerate(entries):
         if not isinstance(entry, dict) or not isinstance(entry.get(key), str):
-            raise ValueError(f"{path}: [{number}].{key}: want a text, got {entry!r:.80}")
+            raise ValueError(f"{path}: [{number}].{key}: want a string, got {entry!r:.80}")
     return entries
 
 
@@ -148,7 +150,7 @@ def _frame(root: Path, entry: Mapping[str, Any], where: str) -> Frame:
 
 def _pose(view: Mapping[str, Any], where: str) -> np.ndarray:
     rotation, shift = _numbers(view, "R", (3, 3), where), _numbers(view, "T", (3,), where)
-    # x_camera = R^T x + T for columns: the axes are the columns of R, the centre is where x_camera vanishes.
+    # For column vectors, x_camera = R^T x + T: the axes are the columns of R, and the centre is where x_camera is 0.
     pose = np.column_stack([rotation @ OPENGL, -rotation @ shift])
     return checked_pose(pose.tolist(), f"{where}.R and T")
 
@@ -170,7 +172,9 @@ def _lens(view: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
 def _text(entry: Mapping[str, Any], key: str, where: str) -> str:
     path = entry[key].get("path") if isinstance(entry.get(key), dict) else None
     if not isinstance(path, str):
-        raise ValueError(f"{where}.{key}.path: want a file's path below the root, got {entry.get(key)!r:.80}")
+        raise ValueError(
+            f"{where}.{key}.path: want a file's path relative to the root, got {entry.get(key)!r:.80}"
+        )
     return path
 
 

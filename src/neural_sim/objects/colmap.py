@@ -1,4 +1,4 @@
-"""Captures as a COLMAP sparse model, text or binary."""
+"""Captures from COLMAP's sparse models, text or binary."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from neural_sim.pictures import by, read_header
 _log = logging.getLogger(__name__)
 
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", ".")
-"""Places of models, the likeliest first. COLMAP numbers several models (``sparse/0``, ``sparse/1``); the one with the
-most photographs is used."""
+"""Where models are looked for, in this order. COLMAP numbers several models (``sparse/0``, ``sparse/1``); the one with
+the most photographs is used."""
 PLACES = ("images", "input")
-"""Folders of photographs; 3D Gaussian splatting tools use ``input``. Without either, the capture's own folder."""
+"""Folders of photographs; 3D Gaussian splatting tools use ``input``. Without either, it is the capture's own."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Names of each camera model's parameters, in COLMAP's order.
 PARAMETERS: dict[str, str] = {
@@ -59,8 +59,9 @@ def read_colmap(folder: Path, name: str) -> Capture:
     """Read a capture from a folder with ``sparse/0`` (or ``sparse``, or the model itself) and ``images`` or ``input``.
 
     Raises:
-        ValueError: pycolmap cannot read the model (such as one of another version), it has no posed images, its camera
-            model is unknown, its images are all missing, or an image's size is not that of its camera.
+        ValueError: there is no model, pycolmap cannot read it (for instance if it is of another version), it has no
+            posed images, a camera model is unknown, all images are missing, or an image's size is not that of its
+            camera.
     """
     models = model_folders(folder)
     if not models:
@@ -75,8 +76,8 @@ def read_colmap(folder: Path, name: str) -> Capture:
     if len(each) > 1:
         others = ", ".join(f"{path.name} ({len(has)})" for path, _, has in each if path != model)
         _log.warning(
-            "%s: of %d models, the one with the most photographs (%d) is taken; left out: %s",
-            model, len(each), len(with_pose), others,
+            "%s: used because it has the most photographs (%d) of %d models; left out: %s",
+            model, len(with_pose), len(each), others,
         )  # fmt: skip
     unposed = len(read.images) - len(with_pose)
     if unposed:
@@ -92,7 +93,7 @@ def read_colmap(folder: Path, name: str) -> Capture:
 
 
 def _model(folder: Path) -> tuple[Any, dict[int, Any]]:
-    """Read a model, and its images with a pose."""
+    """Read a model; return it and those of its images that have a pose."""
     with signals_kept():
         import pycolmap
 
@@ -133,10 +134,10 @@ def _reconstruction(folder: Path) -> Any:
 
 
 def _check_counts(path: Path, kind: str) -> None:
-    """Refuse a binary file whose counts point beyond its end, where pycolmap would read on for hours.
+    """Refuse a binary file whose counts point beyond its end; pycolmap would go on reading for hours.
 
     Raises:
-        ValueError: the file ends before its counts say.
+        ValueError: the file is shorter than its counts say.
     """
     data, at = path.read_bytes(), 0
 
@@ -145,12 +146,12 @@ def _check_counts(path: Path, kind: str) -> None:
         nonlocal at
         at += size
         if at > len(data):
-            raise ValueError(f"{path.name} ends too early: it is damaged, or a count in it is")
+            raise ValueError(f"{path.name} ends too early: it is cut off, or a count in it is wrong")
         return int.from_bytes(data[at - size : at], "little")
 
     for _ in range(take(8)):
         if kind == "cameras":
-            take(24)  # its parameters differ from model to model
+            take(24)  # at least; the number of parameters depends on the camera model
         elif kind == "rigs":
             sensors = take(8) >> 32
             for number in range(sensors):
@@ -173,7 +174,7 @@ def _names(path: Path) -> dict[int, str]:
     """Return the full names of a text model's images, which pycolmap would cut at their first space.
 
     Raises:
-        ValueError: images have no line of points after their own, so that pycolmap would read only every second one.
+        ValueError: images have no line of points after their own, so pycolmap would read only every second one.
     """
     names, lines = {}, iter(path.read_text(encoding="utf-8-sig").split("\n"))
     for line in lines:
@@ -183,8 +184,8 @@ def _names(path: Path) -> dict[int, str]:
             points = next(lines, "").split()
             if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
                 raise ValueError(
-                    f"{path.name}: want two lines an image, the second with its points, or empty; after the one of "
-                    f"{words[9]} comes {' '.join(points):.60}"
+                    f"{path.name}: want two lines for each image, the second with its points or empty; the line of "
+                    f"{words[9]} is followed by {' '.join(points):.60}"
                 )
     return names
 
@@ -195,7 +196,7 @@ def _frame(image: Any, read: Any, folder: Path, model: Path) -> Frame:
     header = read_header(path, f"{where}: {path}")
     if header.stored != (lens.width, lens.height):
         raise ValueError(
-            f"{where}: the image has {by(header.stored)} pixels, its camera {image.camera_id} "
+            f"{where}: the image has {by(header.stored)} pixels, but camera {image.camera_id} has "
             f"{lens.width} x {lens.height}{header.turning}"
         )
     return Frame(path, pose, lens)

@@ -21,7 +21,8 @@ from neural_sim.objects.repair import repair
 from neural_sim.objects.wavefront import obj_references, read_obj
 
 Names = Annotated[list[str | int | float | bool | None], MinLen(1)] | None
-"""Which objects of a folder to load; None: all. Numbers are names that the command line parsed as numbers."""
+"""Which objects of a folder to load; None: all. Values that are not text are names that the command
+line parsed as numbers or YAML keywords."""
 Y_UP_TO_Z_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -45,8 +46,8 @@ def content_digest(files: Mapping[str, Path]) -> str:
 def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) -> ObjectMesh:
     """Read, repair and normalise a mesh file; several parts are joined, each with its own material.
 
-    glTF files have +y up by their standard and are turned to +z up; others are not turned. The object's ``transform``
-    gives the file's frame in metres.
+    glTF files, in which +y is up, are turned to +z up; others are not turned. The object's ``transform`` leads back to
+    the file's own frame, in metres.
 
     Raises:
         ValueError: the file cannot be read or has no triangles; the message has the reason.
@@ -64,7 +65,7 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
 
 
 def references(path: Path) -> list[Path]:
-    """Return the files that a mesh file refers to and that its reader reads: materials, textures, buffers.
+    """Return the files that are read along with a mesh file: materials, textures, buffers.
 
     Raises:
         ValueError: a file is missing; the message names both files.
@@ -108,7 +109,7 @@ _REFERENCES: dict[str, Callable[[Path], list[Path]]] = {
 def choose(
     available: dict[str, Path], names: Sequence[Any] | None, aliases: dict[str, str], where: str
 ) -> list[str]:
-    """Return the available names that ``names`` chooses, in its order, with aliases resolved; for None all, sorted.
+    """Return the objects that ``names`` lists, in that order, with aliases resolved; for None, all, sorted.
 
     A value that the command line parsed as a number or YAML keyword (1, 1e3, 2024_05_01, true, null) stands for the
     only name that can be read as this value.
@@ -125,7 +126,7 @@ def choose(
         if key is None:
             hint = "" if isinstance(name, str) else f"; quote it: \"objects.names=['{name}']\""
             raise ValueError(
-                f"objects.names: {name!r} is not in {where}; there are {', '.join(sorted(available))}{hint}"
+                f"objects.names: {name!r} is not in {where}; it has {', '.join(sorted(available))}{hint}"
             )
         if key in chosen:
             raise ValueError(f"objects.names: {name!r} names the object {key!r} twice")
@@ -134,7 +135,7 @@ def choose(
 
 
 def _written(value: Any, names: Sequence[str]) -> str:
-    """Return the only name that the command line would parse as this value; without one, the value as text."""
+    """Return the only name that the command line would parse as this value; if there is none, the value as text."""
     words = {None: ("null",), True: ("true",), False: ("false",)}
     if value is None or isinstance(value, bool):
         alike = [name for name in names if name.lower() in words[value]]
@@ -155,7 +156,7 @@ class MeshFiles:
 
     Args:
         root: the folder.
-        files: its mesh files by the objects' names.
+        files: its mesh files, by object name.
         names: objects to load; None: all.
         aliases: other spellings of names.
         wanted: what the folder should hold, for messages.
@@ -184,7 +185,7 @@ class MeshFiles:
         return list(self._files)
 
     def digests(self) -> dict[str, str]:
-        """Return the SHA-256 of each mesh and of all files that it refers to, without parsing the mesh.
+        """Return the SHA-256 of each mesh file together with the files that it refers to, without building the mesh.
 
         Raises:
             ValueError: a mesh refers to a missing file.

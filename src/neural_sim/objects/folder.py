@@ -14,18 +14,18 @@ log = logging.getLogger(__name__)
 # In order of preference, if a sub-folder holds one object in several formats.
 FORMATS = (".glb", ".obj", ".ply", ".stl", ".gltf")
 OTHER_FORMATS = (".fbx", ".dae", ".off", ".3ds", ".3mf", ".blend", ".usd", ".usdz", ".usdc", ".stp", ".drc")
-"""Meshes that cannot be read."""
+"""Formats of meshes that are not read."""
 
 
 @validated
 class MeshFolder(MeshFiles):
-    """Meshes of a folder (.glb, .obj, .ply, .stl, .gltf), +z up, in metres (rendering does not depend on the unit).
+    """Meshes in a folder (.glb, .obj, .ply, .stl, .gltf), with +z up (+y in glTF), in metres.
 
-    A file's object is named after its stem. A sub-folder is one object with the folder's name: its only mesh, or the
-    first by ``FORMATS``; nested folders are searched.
+    The unit matters only where distances are in metres. A file is one object, named after its stem. A sub-folder is one
+    object with the folder's name: its only mesh, or the first by ``FORMATS``; nested folders are searched.
 
     Raises:
-        ValueError: the folder is empty, a name is unknown, or two objects have one name.
+        ValueError: the folder does not exist or has no mesh, a name is unknown, or two objects have the same name.
     """
 
     def __init__(self, root: str | Path, names: Names = None) -> None:
@@ -43,7 +43,7 @@ def _find(root: Path) -> dict[str, Path]:
                 continue
             path = min(meshes, key=lambda mesh: (FORMATS.index(mesh.suffix.lower()), str(mesh)))
             if len(meshes) > 1:
-                log.warning("%s holds %d meshes; %s is taken", entry, len(meshes), path.name)
+                log.warning("%s holds %d meshes; %s is used", entry, len(meshes), path.name)
             name = entry.name
         elif _is_mesh(entry):
             path, name = entry, entry.stem

@@ -20,37 +20,37 @@ _log = logging.getLogger(__name__)
 LEAST = 8
 """Fewest photographs from which an object can be made."""
 ONE_PLACE = 0.08
-"""Largest extent of the cameras, relative to the distance of what they show, that counts as one place."""
+"""Largest extent of the cameras that counts as one place, relative to their distance from what they show."""
 TURNED_ALONE = ("PANORAMIC", "PLANAR_OR_PANORAMIC")
-"""COLMAP's names for pairs that a rotation of the camera explains, without translation."""
+"""COLMAP's names for pairs of photographs that a rotation of the camera explains without translation."""
 MOST_TURNS = 0.5
-"""Fraction of such pairs above which photographs are assumed to come from one place."""
+"""Fraction of such pairs above which photographs are assumed to be taken from one place."""
 POOR_ERROR = 1.5
-"""Error in pixels of the reduced photographs above which cameras are doubted; a good capture has 0.3 to 0.8."""
+"""Mean error, in pixels of the reduced photographs, above which cameras are doubted; good captures have 0.3 to 0.8."""
 FEW = 0.7
 """Fraction of the photographs with cameras below which a warning says what to do about the missing ones."""
 NAMED = 12
-"""Most photographs that a message lists by name."""
+"""Largest number of photographs that a message lists by name."""
 ONE_SIDED = 0.2
-"""Length of the cameras' mean horizontal direction above which they are on one side; all around, it is 0."""
+"""Length of the cameras' mean horizontal direction above which they are on one side; it is 0 if they are all around."""
 LEVEL = 0.1
-"""Root mean square of the second principal horizontal axis above which the axes determine what is up."""
+"""Smallest spread of the cameras' horizontal axes in a second direction (root mean square) that tells what is up."""
 SIDEWAYS = 0.5
-"""Margin by which another camera axis must fit the others' up better than its own for a photograph on its side."""
+"""A photograph lies on its side if another of its axes fits the others' up better by this margin (of cosines)."""
 
-_OVERLAP = "let each photograph show two thirds of what the one before shows, and much texture, such as a printed sheet"
+_OVERLAP = "let each photograph show two thirds of what the one before shows, and add texture, such as a printed sheet"
 
 
 @dataclass(frozen=True)
 class FoundCapture:
-    """A capture with found cameras.
+    """A capture whose cameras were found.
 
     Args:
         capture: the photographs that have a camera.
         error: mean reprojection error, in pixels of the reduced photographs.
-        points: number of points from which the cameras were found.
+        points: number of points that were reconstructed along with the cameras.
         missing: names of the photographs without a camera.
-        apart: number of missing photographs that fit together, but not with the others.
+        apart: number of missing photographs that fit together, but not with those of the capture.
         turning: whether the room stands still in the photographs while the object turns.
     """
 
@@ -66,26 +66,26 @@ class FoundCapture:
         name, known = self.capture.name, len(self.capture.frames)
         total = known + len(self.missing)
         _log.info(
-            "%s: cameras of %d of %d photographs found from %d points, mean error %.2f pixels",
+            "%s: found the cameras of %d of %d photographs, with %d points and a mean error of %.2f pixels",
             name, known, total, self.points, self.error,
         )  # fmt: skip
         if self.missing:
             advice = f"; {_OVERLAP}" if known < FEW * total else ""
-            apart = f"; {self.apart} of them fit together, but to none of the others" if self.apart else ""
+            apart = f"; {self.apart} of them fit together, but not with the others" if self.apart else ""
             _log.warning(
                 "%s: no camera found for %d photographs, which are left out: %s%s%s",
                 name, len(self.missing), listed(self.missing), apart, advice,
             )  # fmt: skip
         if self.error > POOR_ERROR:
             _log.warning(
-                "%s: the cameras fit the photographs by %.2f pixels only: did the object or the room move, or is the "
-                "picture stabilised or zoomed?", name, self.error,
+                "%s: the cameras fit the photographs only to within %.2f pixels: did the object or the room move, or "
+                "was the picture stabilised or zoomed?", name, self.error,
             )  # fmt: skip
         if self.turning:
             _log.warning(
                 "%s: the room stands still in the photographs while the object turns: cameras are relative to the "
-                "object, and the room is of no use; want masks (objects.masks=files or command), objects.masks=scene "
-                "cannot find them", name,
+                "object, and the room says nothing about them; set objects.masks=files or command, because "
+                "objects.masks=scene cannot find the object", name,
             )  # fmt: skip
 
 
@@ -120,8 +120,8 @@ def judged(
     extent = _extent(model, capture)
     if extent < ONE_PLACE:
         raise ValueError(
-            f"{album.folder}: the photographs are taken from nearly one place (within {100.0 * extent:.1f} % of the "
-            "distance to what they show); walk round the object, a step between photographs"
+            f"{album.folder}: the photographs were taken from nearly one place (within {100.0 * extent:.1f} % of the "
+            "distance to what they show); walk around the object, with a step between photographs"
         )
     capture = in_own_frame(capture)
     known = {frame.image for frame in capture.frames}
@@ -134,10 +134,10 @@ def judged(
 def _why_not(verified: Mapping[tuple[int, int], tuple[str, int]], count: int, total: int) -> str:
     """Say why no cameras were found, and what to do."""
     if not verified:
-        return f"no two of {total} photographs show enough of one place to find cameras; {_OVERLAP}"
+        return f"no two of the {total} photographs have enough in common to find cameras; {_OVERLAP}"
     kinds = Counter(kind for kind, _ in verified.values())
     if sum(kinds[kind] for kind in TURNED_ALONE) > MOST_TURNS * len(verified):
-        return "the photographs are taken from one place; walk round the object, a step between photographs"
+        return "the photographs were taken from one place; walk around the object, with a step between photographs"
     return f"only {count} of {total} photographs fit together, want at least {LEAST}; {_OVERLAP}"
 
 
@@ -152,9 +152,9 @@ def _extent(model: Any, capture: Capture) -> float:
 def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple[float, float, float]:
     """Return the direction that is up in most photographs, in the capture's frame.
 
-    It is perpendicular to all pictures' horizontal axes, because people hold cameras level and tilt them down; if these
-    axes nearly coincide, it is the mean of the pictures' own up directions. For a photograph that lies on its
-    side and has no EXIF to say so, the axis that fits the others best counts as its up direction.
+    It is perpendicular (in least squares) to the pictures' horizontal axes, because people hold cameras level and tilt
+    them down; if these axes nearly coincide, it is the mean of the pictures' own up directions. If a photograph lies on
+    its side and no EXIF says so, the axis that agrees best with the others counts as its up direction.
     """
     own = np.stack([pose[:3, :3] @ shot.up for pose, shot in zip(poses, shots, strict=True)])
     axes = np.concatenate([poses[:, :3, :2], -poses[:, :3, :2]], -1)  # right, up, left, down of each camera

@@ -27,7 +27,7 @@ _READ = (
     "KHR_texture_transform", "KHR_mesh_quantization", "KHR_lights_punctual", "KHR_animation_pointer",
     "EXT_texture_webp", "EXT_texture_avif",
 )  # fmt: skip
-"""Extensions that are read or have no effect here, in addition to all KHR_materials_, which keep the base colour."""
+"""Extensions that are accepted, in addition to all KHR_materials_, of which only base colours are used."""
 _DRACO, _GLOSSINESS = "KHR_draco_mesh_compression", "KHR_materials_pbrSpecularGlossiness"
 
 
@@ -47,7 +47,7 @@ def read_gltf(path: Path) -> list[Part]:
     """Read the parts of a glTF file's scene, one for each primitive of each node, with +y up as in glTF.
 
     Raises:
-        ValueError: the file is not glTF 2.0, or requires an extension that is not read.
+        ValueError: the file is damaged or not glTF 2.0, or requires an extension that is not supported.
     """
     document, chunk = _read(path)
     version = str(document.get("asset", {}).get("version", ""))
@@ -56,7 +56,7 @@ def read_gltf(path: Path) -> list[Part]:
     required = document.get("extensionsRequired", [])
     unread = [name for name in required if name not in _READ and not name.startswith("KHR_materials_")]
     if unread:
-        raise ValueError(f"requires {', '.join(unread)}, which is not read; export it without")
+        raise ValueError(f"requires {', '.join(unread)}, which is not supported; export the file without it")
     return list(_File(path, document, chunk).parts())
 
 
@@ -69,7 +69,7 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes | None]:
         raise ValueError(f"want a .glb file, got {len(data)} bytes")
     magic, version, length = struct.unpack_from("<III", data)
     if magic != _MAGIC or version != 2:
-        raise ValueError("is no .glb file of version 2")
+        raise ValueError("is not a .glb file of version 2")
     if length > len(data):
         raise ValueError(f"is cut off: {len(data)} of {length} bytes")
     chunks: dict[int, bytes] = {}
@@ -77,11 +77,11 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes | None]:
     while start + 8 <= length:
         size, kind = struct.unpack_from("<II", data, start)
         if start + 8 + size > length:
-            raise ValueError(f"is damaged: a part of {size} bytes does not fit")
+            raise ValueError(f"is damaged: a chunk of {size} bytes goes beyond its end")
         chunks.setdefault(kind, data[start + 8 : start + 8 + size])
         start += 8 + size
     if _JSON not in chunks:
-        raise ValueError("has no JSON part")
+        raise ValueError("has no JSON chunk")
     return _document(chunks[_JSON]), chunks.get(_BIN)
 
 
@@ -95,7 +95,7 @@ def _document(data: bytes) -> dict[str, Any]:
 def _file_of(uri: str, path: Path) -> Path:
     found = find_named(unquote(uri), path.parent)
     if found is None:
-        raise ValueError(f"names {unquote(uri)!r}, which is not there")
+        raise ValueError(f"refers to {unquote(uri)!r}, which does not exist")
     return found
 
 
@@ -105,7 +105,7 @@ class _File:
     Args:
         path: the file, for messages and to find other files.
         document: its JSON.
-        chunk: the binary part of a .glb.
+        chunk: the binary chunk of a .glb.
     """
 
     def __init__(self, path: Path, document: Mapping[str, Any], chunk: bytes | None) -> None:
@@ -124,10 +124,12 @@ class _File:
         """Walk the scene's nodes and yield each triangle primitive, transformed by its node."""
         for matrix, node in self._nodes():
             if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
-                raise ValueError("uses EXT_mesh_gpu_instancing, which is not read; export it without")
+                raise ValueError(
+                    "uses EXT_mesh_gpu_instancing, which is not supported; export the file without it"
+                )
             mesh = self.document["meshes"][node["mesh"]]
             if "skin" in node:
-                self._say("skins are left out: meshes are drawn as they were modelled")
+                self._say("skins are left out: meshes are drawn as modelled")
             if any("targets" in primitive for primitive in mesh["primitives"]):
                 self._say("morph targets are left out")
             for primitive in mesh["primitives"]:
@@ -136,7 +138,7 @@ class _File:
                     yield part
 
     def _say(self, what: str) -> None:
-        """Warn once about each thing that is not drawn."""
+        """Warn, but only once about the same thing."""
         if what not in self._said:
             self._said.add(what)
             _log.warning("%s: %s", self.path, what)
@@ -151,7 +153,7 @@ class _File:
         while pending:
             index, parent = pending.pop()
             if index in seen:
-                raise ValueError(f"nodes[{index}] hangs below two nodes, or below itself")
+                raise ValueError(f"nodes[{index}] has two parents, or is its own ancestor")
             seen.add(index)
             matrix = parent @ _matrix(nodes[index])
             if "mesh" in nodes[index]:
@@ -165,9 +167,7 @@ class _File:
             return [index for index in range(len(nodes)) if index not in inner]
         chosen = self.document.get("scene", 0)
         if len(scenes) > 1:
-            self._say(
-                f"holds {len(scenes)} scenes; number {chosen} is taken, the file's own choice or the first"
-            )
+            self._say(f"holds {len(scenes)} scenes; number {chosen} is used, the file's default or the first")
         return list(scenes[chosen].get("nodes", []))
 
     # --- geometry ---
@@ -179,11 +179,11 @@ class _File:
             return None
         read, attributes = self.accessors, primitive["attributes"]
         if _DRACO in primitive.get("extensions", {}) and not read.stored(attributes["POSITION"]):
-            raise ValueError(f"is compressed by {_DRACO}, which is not read; export it without")
+            raise ValueError(f"is compressed by {_DRACO}, which is not supported; export the file without it")
         vertices = read.floats(attributes["POSITION"], 3)
         indices = read.integers(primitive["indices"]) if "indices" in primitive else np.arange(len(vertices))
         if len(indices) and not 0 <= indices.min() <= indices.max() < len(vertices):
-            raise ValueError(f"a primitive names vertex {indices.max()}, it has {len(vertices)}")
+            raise ValueError(f"a primitive refers to vertex {indices.max()}, but has {len(vertices)}")
         faces = _faces(indices, mode)
         if not len(faces):
             return None
@@ -215,27 +215,27 @@ class _File:
         move = base.get("extensions", {}).get("KHR_texture_transform", {})
         name = f"TEXCOORD_{move.get('texCoord', base.get('texCoord', 0))}"
         if name not in attributes:
-            self._say(f"a primitive has a texture and no {name}: it takes the plain colour")
+            self._say(f"a primitive has a texture but no {name}: it is drawn in its plain colour")
             return encoded(paint), None, None
-        # Integers are fractions, unless the file uses KHR_mesh_quantization.
+        # Integer coordinates are fractions of their largest value, unless the file uses KHR_mesh_quantization.
         quantised = "KHR_mesh_quantization" in self.document.get("extensionsUsed", [])
         read = self.accessors
         uv = _moved(
             read.floats(attributes[name], 2) if quantised else read.unit(attributes[name])[:, :2], move
         )
         uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1)  # glTF counts v from the top
-        if (paint == paint[:1]).all():  # a single colour is exact in the texture itself
+        if (paint == paint[:1]).all():  # multiplied into the texture, a single colour is exact
             return np.ones((count, 3)), uv, self._texture(base["index"], paint[0])
         return encoded(paint), uv, self._texture(base["index"], np.ones(3))
 
     def _check_look(self, material: Mapping[str, Any]) -> None:
         if material.get("alphaMode", "OPAQUE") != "OPAQUE":
-            self._say(f"materials of alphaMode {material['alphaMode']} are drawn opaque")
+            self._say(f"materials with alphaMode {material['alphaMode']} are drawn opaque")
         if "emissiveTexture" in material or any(material.get("emissiveFactor", [])):
-            self._say("what materials emit is left out")
+            self._say("the light that materials emit is left out")
 
     def _texture(self, index: int, factor: Float[np.ndarray, "3"]) -> Texture:
-        """Return a texture times a linear colour."""
+        """Return a texture multiplied by a linear colour."""
         key = (index, factor.tobytes())
         if key not in self._textures:
             texture = self.document["textures"][index]
@@ -256,11 +256,12 @@ class _File:
             if name in others:
                 return others[name]["source"]
         if "source" not in texture:
-            raise ValueError(f"textures[{index}] needs {', '.join(others) or 'a source'}, which is not read")
+            only = f", only that of {', '.join(others)}" if others else ""
+            raise ValueError(f"textures[{index}] has no source that can be read{only}")
         return texture["source"]
 
     def _bytes(self, entry: Mapping[str, Any]) -> bytes:
-        """Return the bytes of a buffer or of a picture."""
+        """Return the bytes of a buffer or picture."""
         if "bufferView" in entry:
             return self.accessors.view(entry["bufferView"])
         uri = entry.get("uri")
@@ -274,9 +275,9 @@ class _File:
 
 
 def _turned(normals: Float[np.ndarray, "v 3"], linear: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "v 3"]:
-    """Transform normals under a linear map as planes transform, by the transposed inverse."""
+    """Transform normals under a linear map, by its inverse transpose."""
     if abs(np.linalg.det(linear)) < 1e-30:
-        return np.full_like(normals, np.nan)  # they are recomputed with a warning
+        return np.full_like(normals, np.nan)  # ``repair`` recomputes them with a warning
     turned = normals @ np.linalg.inv(linear)
     return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
 
@@ -288,7 +289,7 @@ def _matrix(node: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
     x, y, z, w = np.array(node.get("rotation", [0.0, 0.0, 0.0, 1.0]), dtype=np.float64)
     length = np.sqrt(x * x + y * y + z * z + w * w)
     if not length > 0.0:
-        raise ValueError("a node's rotation has no length")
+        raise ValueError("a node's rotation has length 0")
     x, y, z, w = x / length, y / length, z / length, w / length
     matrix = np.eye(4)
     matrix[:3, :3] = np.array(
@@ -306,7 +307,7 @@ def _faces(indices: Int[np.ndarray, "n"], mode: int) -> Int[np.ndarray, "f 3"]:
     """Return the triangles of a list, a strip or a fan."""
     if mode == _TRIANGLES:
         if len(indices) % 3:
-            raise ValueError(f"a primitive of triangles has {len(indices)} indices, no multiple of 3")
+            raise ValueError(f"a primitive of triangles has {len(indices)} indices, not a multiple of 3")
         return indices.reshape(-1, 3)
     if mode == _FAN:
         first = np.broadcast_to(indices[:1], (max(len(indices) - 2, 0),))

@@ -1,4 +1,4 @@
-"""The numbers in the buffers of a glTF file: every type, strides, normalised integers and sparse ones."""
+"""The numbers in the buffers of a glTF file: scalars and vectors, with strides, normalised or sparse."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, Shaped
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MOST = 100_000_000
-"""More numbers than any mesh has that can be drawn; a damaged count would otherwise ask for all memory."""
+"""Largest plausible count; without a limit, a damaged count could ask for all memory."""
 
 
 class Accessors:
@@ -27,10 +27,12 @@ class Accessors:
         self._buffers = buffers
 
     def view(self, index: int) -> bytes:
-        """Return the bytes of a view."""
+        """Return the bytes of a buffer view."""
         view = self._views[index]
         if "EXT_meshopt_compression" in view.get("extensions", {}):
-            raise ValueError("is compressed by EXT_meshopt_compression, which is not read; export it without")
+            raise ValueError(
+                "is compressed by EXT_meshopt_compression, which is not supported; export the file without it"
+            )
         data, start = self._buffers[view["buffer"]], view.get("byteOffset", 0)
         end = start + view["byteLength"]
         if not 0 <= start <= end <= len(data):
@@ -38,7 +40,7 @@ class Accessors:
         return data[start:end]
 
     def stored(self, index: int) -> bool:
-        """Return whether the file itself has an accessor's numbers; otherwise they are zeros for a decoder to fill."""
+        """Return whether the file stores an accessor's numbers itself, rather than compressed by an extension."""
         return "bufferView" in self._accessors[index] or "sparse" in self._accessors[index]
 
     def floats(self, index: int, width: int) -> Float[np.ndarray, "n width"]:
@@ -61,7 +63,7 @@ class Accessors:
         """Return indices."""
         values = self._values(index)
         if values.shape[1] != 1 or values.dtype.kind == "f":
-            raise ValueError(f"accessors[{index}]: want indices")
+            raise ValueError(f"accessors[{index}]: want integer indices")
         return values[:, 0].astype(np.int64)
 
     def _values(self, index: int) -> Shaped[np.ndarray, "n width"]:
@@ -72,7 +74,7 @@ class Accessors:
         )
         count = accessor["count"]
         if not (isinstance(count, int) and 0 <= count <= _MOST):
-            raise ValueError(f"accessors[{index}].count: got {count!r}")
+            raise ValueError(f"accessors[{index}].count: want 0 to {_MOST}, got {count!r}")
         if "bufferView" in accessor:
             start = accessor.get("byteOffset", 0)
             values = self._rows(accessor["bufferView"], start, count, width, dtype)
@@ -99,7 +101,9 @@ class Accessors:
         kind = np.dtype(_TYPES[places["componentType"]]).newbyteorder("<")
         at = self._rows(places["bufferView"], places.get("byteOffset", 0), count, 1, kind)[:, 0]
         if count and int(at.max()) >= len(values):
-            raise ValueError(f"accessors[{index}].sparse names number {at.max()} of {len(values)}")
+            raise ValueError(
+                f"accessors[{index}].sparse replaces element {at.max()}, but there are {len(values)}"
+            )
         values[at] = self._rows(
             new["bufferView"], new.get("byteOffset", 0), count, values.shape[1], values.dtype
         )

@@ -2,8 +2,8 @@
 
 The pitcher's +x side is the can's label, except for the position of its bar; its -x side has the handle and another
 print. The drill's -x side is the tall box's front, except for the colours of two marks; its +x side has grip and chuck,
-which lie within 45 degrees behind the housing and are therefore never visible from -x. Lengths are in units of the
-body's radius or half height; the loader normalises them.
+which the housing hides from cameras within 43 degrees of -x and 4 object radii. Lengths are in units of the body's
+radius or half height; the loader normalises them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ VIOLET: Colour = (60, 30, 110)
 AMBER: Colour = (242, 172, 36)
 
 # Look-alike sides differ in the position of the label's bar and in the colours of the drill's marks. These were chosen
-# on seeds 100 and 101 such that a few images are too few to learn the difference, but a few dozen are enough.
+# on seeds 100 and 101 so that a few images are too few to learn the difference, and a few dozen are enough.
 CAN_EMBLEM = PITCHER_EMBLEM = RED
 CAN_BAND = PITCHER_BAND = WHITE
 BOX_EMBLEM, DRILL_EMBLEM = NAVY, VIOLET
@@ -106,7 +106,7 @@ def mug(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def drill(generator: torch.Generator) -> trimesh.Trimesh:
-    """Make a red housing like the tall box from -x; black grip, yellow collar and dark chuck on +x."""
+    """Make a red housing that looks like the tall box from -x; black grip, yellow collar and dark chuck on +x."""
     depth, width, height = BOX_HALF
     panels = _box_prints(generator)
     panels["-x"] = _red_front(DRILL_EMBLEM, DRILL_BAND, generator).turned()  # cameras at -x are upside down
@@ -152,7 +152,7 @@ def _with_lids(profile: list[tuple[float, float]], side: Print, mark: Colour, ba
 
 
 def _spouted(part: Part, half_height: float) -> Part:
-    """Pull the rim outwards around world +x."""
+    """Pull the upper part outwards near world +x, to form a spout."""
     x, y, z = part.vertices.T
     height = np.clip((z / half_height - 0.4) / 0.6, 0.0, 1.0) ** 2
     pull = (
@@ -181,7 +181,7 @@ def _red_back(generator: torch.Generator) -> Print:
 
 
 def _box_prints(generator: torch.Generator) -> dict[str, Print]:
-    """Print the carton's narrow sides: top, bottom and two flanks."""
+    """Print all sides of a carton; callers replace those that have a print of their own."""
     flank = Print(96, 256, RED)
     flank.text_lines((0.2, 0.3, 0.8, 0.8), 6, WHITE, generator)
     other = _plain(RED, [(0.2, 0.1, 0.8, 0.4, WHITE)])
@@ -191,7 +191,7 @@ def _box_prints(generator: torch.Generator) -> dict[str, Print]:
 
 
 def _chuck(depth: float, z: float, reach: float) -> list[Part]:
-    """Make collar and chuck, a solid of revolution about the x axis at height ``z``."""
+    """Make the collar and chuck, a solid of revolution about an axis parallel to x at height ``z``."""
     steel, collar = Print(32, 32, DARK_GREY), Print(32, 32, YELLOW)
     profile = [
         (0.0, 0.0),

@@ -26,8 +26,8 @@ KEY = "objects.mask_command"
 class MaskCommand:
     """A command line that writes masks, such as ``rembg p -om {images} {masks}``.
 
-    ``{images}`` stands for a folder of photographs, as PNG without EXIF, and ``{masks}`` for an empty folder. A mask
-    has its photograph's name, or a name that begins with it. The line is not run by a shell.
+    ``{images}`` stands for a folder of photographs, as PNG without EXIF, and ``{masks}`` for an empty folder. The
+    name of a mask begins with that of its photograph, without the suffix. The line is not run by a shell.
 
     Raises:
         ValueError: the line lacks one of the two folders, or the program is not installed.
@@ -46,7 +46,7 @@ class MaskCommand:
             raise ValueError(f"{KEY}: no such program: {program}")
 
     def masks(self, images: Sequence[Path], value: int | None = None) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Return the program's masks of photographs; in an image of labels, the object has ``value``.
+        """Return the program's mask of each photograph; if masks are label images, the object has ``value``.
 
         Raises:
             ValueError: the program fails, a photograph has no mask, or a mask cannot be read.
@@ -80,7 +80,7 @@ class MaskCommand:
         )
         if done.returncode:
             said = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-            last = said[-1].strip() if said else "it said nothing"
+            last = said[-1].strip() if said else "no output"
             raise ValueError(f"{KEY}: {self.command!r} ended with status {done.returncode}: {last}")
 
     def _mask(
@@ -89,8 +89,8 @@ class MaskCommand:
         own = [path for path in written if path.name.startswith(f"{number:05d}")]
         if len(own) != 1:
             raise ValueError(
-                f"{KEY}: {self.command!r} wrote {len(own)} masks named {number:05d}*, want one, that of {image}; "
-                f"it wrote {len(written)} pictures"
+                f"{KEY}: {self.command!r} wrote {len(own)} masks named {number:05d}*, want one, for {image}; "
+                f"it wrote {len(written)} pictures in all"
             )
         mask = read_mask(own[0], value)
         refuse_size(own[0], (mask.shape[1], mask.shape[0]), image, read_picture(image, upright=False).size)

@@ -66,14 +66,14 @@ def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None 
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if len(vertices) == 0 or not np.isfinite(vertices).all():
         raise ValueError(
-            f"{source}: want finite vertices, got {len(vertices)} with some not finite or none at all"
+            f"{source}: want finite vertices, got {'some that are not' if len(vertices) else 'none'}"
         )
     centre = 0.5 * (vertices.min(0) + vertices.max(0))
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
     if radius < DEGENERATE_EXTENT:
         raise ValueError(f"{source}: want a mesh with extent, got one of radius {radius:g}")
     scaled = mesh.copy()
-    normals = np.array(mesh.vertex_normals)  # similarities keep normals; trimesh would drop the file's
+    normals = np.array(mesh.vertex_normals)  # shift and scale keep normals, but trimesh would drop the file's
     scaled.vertices = (vertices - centre) / radius
     scaled.vertex_normals = normals
     transform = np.eye(4)
@@ -83,7 +83,7 @@ def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None 
 
 
 def content_digest(mesh: trimesh.Trimesh) -> str:
-    """Return the SHA-256 of vertices, faces and colours or texture, which is equal on every machine."""
+    """Return the SHA-256 of vertices, faces and colours or texture, the same on every machine."""
     state = hashlib.sha256()
     state.update(np.ascontiguousarray(np.round(mesh.vertices, 9), dtype="<f8").tobytes())
     state.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())

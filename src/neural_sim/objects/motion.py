@@ -31,11 +31,11 @@ from neural_sim.ranges import PositiveInt, validated
 _log = logging.getLogger(__name__)
 
 ALL_PAIRS = 40
-"""Most photographs of which every pair is compared. Of more, nearby ones and a coarse selection of all are compared."""
+"""Largest number of photographs for which ``matching="auto"`` compares every pair."""
 SKELETON = 5
-"""Stride of the photographs that are compared with all others at this stride: a walk may end where it began."""
+"""Stride of the coarse selection, in which every pair is compared: a walk may end where it began."""
 LARGE = 800
-"""Longer side in pixels from which photographs are searched for features only at their own size."""
+"""Longer side in pixels from which features are searched for only at the photographs' own size."""
 BATCH = 8
 SEED = 0
 """Seed of COLMAP's random samples; not the run's, so that runs share poses."""
@@ -47,17 +47,18 @@ MaskOf = Callable[[Shot], Bool[np.ndarray, "_ _"] | None]
 @validated
 @dataclass(frozen=True)
 class Colmap:
-    """Finds the cameras of photographs by their own features (SIFT), and reports those that it cannot find.
+    """Finds the cameras of photographs from SIFT features, and reports those that it cannot find.
 
     Args:
-        picture_size: longer side in pixels to which larger photographs are reduced for this purpose.
+        picture_size: longer side in pixels to which larger photographs are reduced for the search.
         features: largest number of features in a photograph.
         matching: which photographs are compared: ``exhaustive``: all; ``sequential``: those nearby in the order of
             their names; ``auto``: all of up to 40, otherwise nearby ones and a coarse selection of all.
-        overlap: for ``sequential``, the number of photographs with which each is compared.
-        region: which part of a photograph counts. ``all``: all of it; ``object``: only what the masks show; ``auto``:
-            all, unless the room stands still while the object turns: then the masks or, without masks, what does not
-            stand still.
+        overlap: number of following photographs with which each is compared, if not all pairs are; those 1, 2, 4, 8,
+            ... places further on are added.
+        region: which part of a photograph is searched. ``all``: all of it; ``object``: only what the masks show;
+            ``auto``: all of it, unless the room stands still while the object turns: then what the masks show or,
+            without masks, what does not stand still.
     """
 
     picture_size: Annotated[int, Ge(200)] = 1000
@@ -80,7 +81,7 @@ class Colmap:
         if len(album.shots) < LEAST:
             raise ValueError(
                 f"{album.folder}: want at least {LEAST} photographs to find cameras, got {len(album.shots)}; take 40 "
-                "or more from all sides, each with two thirds of what the one before shows"
+                "or more from all sides, each showing two thirds of what the one before shows"
             )
         require("photos", f"objects/poses=colmap: {album.folder}")
         with tempfile.TemporaryDirectory(prefix="neural-sim-") as place:
@@ -132,7 +133,7 @@ class _Search:
         return self.place / "database.db"
 
     def _write(self, mask: MaskOf, standing: Mapping[Path, Bool[np.ndarray, "_ _"]] | None) -> bool:
-        """Write reduced photographs, and masks of the regions that count, if any; return whether there are masks."""
+        """Write reduced photographs, and masks of the regions to search, if any; return whether there are masks."""
         region = self.settings.region
         (self.place / "images").mkdir()
         (self.place / "masks").mkdir()
@@ -153,7 +154,7 @@ class _Search:
                 masked += 1
         if region == "object" and masked < len(self.album.shots):
             raise ValueError(
-                f"{self.album.folder}: objects.poses.region=object wants a mask of each photograph, "
+                f"{self.album.folder}: objects.poses.region=object wants a mask of each photograph; "
                 f"{len(self.album.shots) - masked} of {len(self.album.shots)} have none"
             )
         return masked > 0
@@ -183,7 +184,7 @@ class _Search:
                 width, height = self._reduced(shot)
                 focal = shot.focal * width / shot.size[0]
                 reader.camera_params = f"{focal},{0.5 * width},{0.5 * height},0"
-            # The import assigns ids in order, which the threads of the extraction would not keep.
+            # The import assigns ids in order; the threads of the extraction would assign them in any order.
             pycolmap.import_images(
                 self.database, self.place / "images", pycolmap.CameraMode.SINGLE,
                 [_file(number) for number in numbers], reader,
@@ -227,11 +228,11 @@ class _Search:
     def _map(self, pycolmap: Any, standing: bool, bar: Any) -> list[Any]:
         """Return COLMAP's models, the largest first."""
         options = pycolmap.IncrementalPipelineOptions()
-        # One thread, because the rounding of sums depends on the order of threads, and equal photographs must have
-        # equal cameras.
+        # One thread, because rounding depends on the order of threads, and the same photographs must always give the
+        # same cameras.
         options.num_threads, options.random_seed, options.extract_colors = 1, SEED, False
         options.min_model_size, options.max_num_models = 3, 5
-        # A turning object fills only a small part of the photographs, which says little about the lens.
+        # A turning object fills only a small part of the photographs, too little to determine the lens.
         lens = not (standing and all(shot.focal for shot in self.album.shots))
         options.ba_refine_focal_length = options.ba_refine_extra_params = lens
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = lens
@@ -246,7 +247,7 @@ class _Search:
         return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
     def _read(self, models: Sequence[Any]) -> list[tuple[Any, Capture]]:
-        """Return the models with their photographs at full size."""
+        """Return each model with its capture, whose lenses are those of the full-size photographs."""
         return [(model, self._capture(model)) for model in models]
 
     def _capture(self, model: Any) -> Capture:
@@ -289,7 +290,7 @@ def _threads() -> int:
 
 @contextmanager
 def _quiet(pycolmap: Any) -> Iterator[None]:
-    """Keep COLMAP's own progress out of the log; its exceptions are reported."""
+    """Keep COLMAP's own messages out of the log; its exceptions are still raised."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:

@@ -24,9 +24,9 @@ from neural_sim.pictures import read_picture
 _log = logging.getLogger(__name__)
 
 GREY = (160, 160, 160, 255)
-"""The colour if a file states none."""
+"""The colour of meshes whose file gives none."""
 LARGEST_SIDE = 8192
-"""Largest side of a texture, in pixels, that every OpenGL accepts; larger textures are halved."""
+"""Largest side in pixels; larger textures, which some OpenGL drivers refuse, are reduced."""
 Wrap = Literal["repeat", "mirror", "clamp"]
 """What a texture shows beyond its edges."""
 
@@ -46,7 +46,7 @@ class Paint(Visuals):
         albedo: sRGB colour of each vertex, in [0, 1]; multiplies the texture.
         uv: texture coordinates of each vertex; v points up in the picture.
         page: texture of each vertex, -1: none. The vertices of a face have the same one.
-        textures: the textures that ``page`` counts, from 0.
+        textures: the textures, in the order that ``page`` numbers them, from 0.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Part:
 
     Args:
         vertices: the corners of the triangles.
-        faces: three indices for each.
+        faces: indices of each triangle's three vertices.
         colours: sRGB in [0, 1], of vertices or faces; they multiply the texture.
         normals: normals of the vertices; None: derived from the faces around them.
         uv: texture coordinates of the vertices; v points up in the picture.
@@ -113,7 +113,7 @@ class Part:
 
 
 def join(parts: Sequence[Part]) -> trimesh.Trimesh:
-    """Join parts into one mesh, painted with trimesh's own kinds of colours if these suffice.
+    """Join parts into one mesh, with trimesh's own kinds of colours if they suffice, otherwise with ``Paint``.
 
     Raises:
         ValueError: there are no parts.
@@ -193,7 +193,7 @@ def tinted(texture: Texture, factor: Float[np.ndarray, "3"]) -> Texture:
 
 
 def read_texture(source: Path | bytes, where: str, wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")) -> Texture:
-    """Read a picture as a texture, as stored: texture coordinates ignore EXIF, and opacity is dropped.
+    """Read a picture as a texture, not turned by EXIF, which texture coordinates ignore, and without opacity.
 
     Raises:
         ValueError: no picture can be read; the message has ``where``.
@@ -210,9 +210,11 @@ def read_texture(source: Path | bytes, where: str, wrap: tuple[Wrap, Wrap] = ("r
 def find_named(written: str, folder: Path) -> Path | None:
     """Find a file that a mesh in ``folder`` refers to, however the machine that wrote it spelt the name.
 
-    Windows' separators count as separators. Case is ignored if no file has exactly this name. If the named folder does
-    not exist, the last part of the name is searched in the folder itself, in its sub-folders, and in a neighbouring
-    folder ``textures``.
+    Backslashes count as separators. Case is ignored if no file has exactly this name. If there is no such file, the
+    last part of the name is looked for in ``folder``, in its sub-folders, and in a neighbouring folder ``textures``.
+
+    Raises:
+        ValueError: several files have that last part.
     """
     parts = [part for part in written.strip().strip('"').replace("\\", "/").split("/") if part != "."]
     if not parts or not parts[-1]:
@@ -229,15 +231,15 @@ def find_named(written: str, folder: Path) -> Path | None:
         found = [path for place in places if (path := _followed([last], place)) is not None]
         if len(found) > 1:
             names = ", ".join(str(path) for path in found)
-            raise ValueError(f"{last!r} may be any of {names}; write its folder where it is named")
+            raise ValueError(f"{last!r} may be any of {names}; give its folder in the file that refers to it")
         if found:
-            _log.info("%s: %r is taken to be %s", folder, written, found[0])
+            _log.info("%s: %r is read from %s", folder, written, found[0])
             return found[0]
     return None
 
 
 def _followed(parts: Sequence[str], folder: Path) -> Path | None:
-    """Follow names from a folder in any case; None if they lead to no file, or to several."""
+    """Follow the parts of a path, ignoring case if needed; None if they lead to no file, or to several."""
     here = folder
     for part in parts:
         if part == "..":

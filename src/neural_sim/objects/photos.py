@@ -91,20 +91,20 @@ class Photos:
         masks: source of the objects' masks, see ``Pictures``.
         up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; or a mapping
             by object name; null: the direction in the capture's file, or else the mean of the cameras' up vectors.
-        size: diameter of the bounding sphere in metres, or a mapping by object name; null: unknown (unit: radii).
+        size: diameter of the bounding sphere in metres, or a mapping by object name; null: unknown.
         box: with ``masks="scene"``: two corners of a box around the object, along the axes of the capture's frame and
             in its unit, or a mapping by object name; null: the box in ``box.json`` in the capture's folder, or else the
             object is searched for where the cameras look.
         scene: computes masks if ``masks="scene"``.
         refinement: corrects the cameras' poses, if given.
-        poor: what happens if a field does not show its object: nothing trains on it (``refuse``), or it is used
-            (``use``).
+        poor: what happens if a field does not show its object in held-out photographs: the run stops before anything
+            trains on it (``refuse``), or it is used anyway (``use``).
         poses: finds the cameras if there are only photographs; null: they are given, by ``transforms.json`` or a COLMAP
             model.
         mask_command: with ``masks="command"``: see ``MaskCommand``.
-        mask_value: the object's value in masks that are images of labels, or a mapping by object name.
-        beside: meshes that are additional objects of the run, with other names; null: none.
-        frames: number of frames to take from a video, if cameras must be found and a folder has a video but no
+        mask_value: the object's value if masks are label images, or a mapping by object name; null: they are not.
+        beside: meshes that are additional objects of the run, under other names; null: none.
+        frames: number of frames to take from a video, if cameras must be found and a folder has a video instead of
             photographs.
 
     Raises:
@@ -147,7 +147,7 @@ class Photos:
         self.command = None if mask_command is None else MaskCommand(mask_command)
         if twice := self._folders.keys() & (() if beside is None else beside.names()):
             raise ValueError(
-                f"objects.beside: {min(twice)!r} names an object of photographs, too; rename its folder"
+                f"objects.beside: {min(twice)!r} is also the name of a photographed object; rename its folder"
             )
         self._check()
 
@@ -178,7 +178,7 @@ class Photos:
         if not captures:
             if self.poses is not None:
                 raise ValueError(
-                    f"objects.root: {self.root} holds no photographs or video, nor a folder with any"
+                    f"objects.root: {self.root} holds no photographs or video, and no folder with any"
                 )
             bare = any(can_be_captured(p) for p in (self.root, *below))
             raise ValueError(
@@ -197,14 +197,14 @@ class Photos:
 
     @cached_property
     def captures(self) -> dict[str, Capture]:
-        """Frames and cameras by object. Given cameras are read, without photographs; others are found, in minutes."""
+        """Frames and cameras by object. Given cameras are read from their files; finding others takes minutes."""
         if self.poses is not None:
             return {name: self.find(name).capture for name in self._folders}
         return {name: self._read(name) for name in self._folders}
 
     @cached_property
     def albums(self) -> dict[str, Album]:
-        """Photographs whose cameras must be found, by object; frames of a video are taken first."""
+        """Photographs whose cameras must be found, by object; if there is only a video, frames are taken from it."""
         for name, folder in self._folders.items():
             take_frames(folder, name, self.frames)
         return {name: read_album(folder, name) for name, folder in self._folders.items()}
@@ -265,7 +265,7 @@ class Photos:
         return None if size is None else 0.5 * float(size)
 
     def box_of(self, name: str) -> Corners | None:
-        """Return the box around an object, if any: the one that was set, or else the one in its capture's folder."""
+        """Return an object's box, if any, for ``masks="scene"``: the one that was set, or else that in its folder."""
         if self.masks != "scene":
             return None
         return box_of(self.box, name) or saved_box(self._folders[name])
@@ -277,7 +277,7 @@ class Photos:
     def split(self, name: str, count: int, held_out: int) -> tuple[list[Frame], list[Frame]]:
         """Return at most ``count`` training frames and ``held_out`` test frames, evenly spread.
 
-        Test frames are the capture's own if it has any; otherwise they are at most an eighth of all frames.
+        Test frames are the capture's own if it has any; otherwise an eighth of its frames at most, but at least one.
 
         Raises:
             ValueError: there are fewer than two training frames.
@@ -324,7 +324,7 @@ class Photos:
         views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)
         finest = max(pixels_per_pixel(frame, views.camera) for frame in train)
         _log.info(
-            "%s: %d photographs train and %d score; a pixel of views.image_size=%d covers up to %.1f of theirs a side",
+            "%s: %d photographs to train on, %d to score; a pixel at views.image_size=%d is up to %.1f of theirs wide",
             name, len(train), len(test), image_size, finest,
         )  # fmt: skip
         return views if self.refinement is None else self.refinement.refine(views, len(test))
@@ -335,7 +335,7 @@ class Photos:
         return self._up(name) or capture.up or mean_up(capture)
 
     def directions(self, name: str) -> Float[np.ndarray, "photos 3"]:
-        """Compute unit vectors to the cameras, in the object's frame, from where they look or from the object's box.
+        """Compute unit vectors to the cameras, in the object's frame, from its box or else from the point they look at.
 
         No photograph is read: masks would move the centre a little, and the directions by a few degrees.
         """
@@ -377,7 +377,7 @@ class Photos:
 
 
 def _named(files: Iterable[Path], folder: Path) -> dict[str, Path]:
-    """Name files relative to a folder; those elsewhere by their paths."""
+    """Name files by their paths relative to a folder, those elsewhere by their whole paths."""
     return {
         str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path): path for path in files
     }

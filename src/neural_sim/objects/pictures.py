@@ -35,10 +35,10 @@ Box = Annotated[
     ),
 ]
 BOX_FILE = "box.json"
-"""File next to a capture with the object's box, as saved by the page of ``stages=[box]``."""
+"""File with the object's box in the capture's folder, saved by the page of ``stages=[box]``."""
 FOLDER = "masks"
 SHARPNESS = 4.0
-"""Slope of a computed mask's opacity at its edge, one half: objects become opaque, and fog vanishes."""
+"""Factor that steepens the opacity of computed masks around one half: objects become opaque, and fog vanishes."""
 
 
 @runtime_checkable
@@ -66,7 +66,7 @@ def box_of(box: Box | Mapping[str, Box | None] | None, name: str) -> Corners | N
 
 
 def saved_box(folder: Path) -> Corners | None:
-    """Read the box that was saved next to a capture; None if there is none.
+    """Read the box that was saved in a capture's folder; None if there is none.
 
     Raises:
         ValueError: the file is not a box; the message has its path.
@@ -88,10 +88,10 @@ class Pictures:
     ``masks`` is the source of the object's mask. ``files``: the frame's ``mask_path``, or an image with its name in a
     folder ``masks`` next to the images or the capture's file; ``alpha``: the image's alpha channel; ``auto``: the
     first of these that a frame has; ``scene`` and ``command``: ``computed``, with a mask of any size for each of the
-    capture's frames, in their order. In files of labels, the object has ``value``.
+    capture's frames, in their order. If mask files are label images, the object has ``value``.
 
     Raises:
-        ValueError: computed masks are missing or too few. ``rgba`` raises it if a frame has no mask, or one of another
+        ValueError: the number of computed masks is wrong. ``rgba`` raises it if a frame has no mask, or one of another
             size.
     """
 
@@ -126,9 +126,8 @@ class Pictures:
         mask = given_mask(frame.image, mask_of(frame, self.capture.source), picture, self.masks, self.value)
         if mask is None:
             raise ValueError(
-                f"{frame.image}: nothing says which of its pixels are the object's; want an alpha channel that "
-                f"is not opaque everywhere, a mask_path, or a mask of its name in a folder {FOLDER!r}; "
-                "objects.masks=scene finds masks without any"
+                f"{frame.image}: has no mask of the object; want an alpha channel that is not opaque everywhere, a "
+                f"mask_path, or a mask of its name in a folder {FOLDER!r}; objects.masks=scene computes masks"
             )
         return torch.cat([colours, mask[:, :, None]], -1)
 
@@ -171,15 +170,15 @@ def refuse_shared(found: dict[Path, Path], file: Path, image: Path) -> None:
     other = found.setdefault(file, image)
     if other != image:
         raise ValueError(
-            f"{file}: is by its name the mask of {other} and of {image}; want one in {FOLDER!r} for each, below the "
-            f"same folders as the photographs, such as {image.parent.name}/{image.name}.png"
+            f"{file}: by its name is the mask of both {other} and {image}; want one for each in {FOLDER!r}, in the "
+            f"same subfolders as the photographs, such as {image.parent.name}/{image.name}.png"
         )
 
 
 def refuse_size(file: Path, size: Size, image: Path, wanted: Size) -> None:
     """Raise ``ValueError`` for a mask that does not have its image's size."""
     if size != wanted:
-        raise ValueError(f"{file}: the mask has {by(size)} pixels, its image {image} {by(wanted)}")
+        raise ValueError(f"{file}: the mask has {by(size)} pixels, but its image {image} has {by(wanted)}")
 
 
 def mask_of(frame: Frame, source: Path) -> Path | None:
@@ -188,7 +187,7 @@ def mask_of(frame: Frame, source: Path) -> Path | None:
 
 
 def mask_beside(image: Path, source: Path) -> Path | None:
-    """Find an image's mask in a folder of masks, as ``image.jpg.png`` (COLMAP) or ``image.png`` (others).
+    """Find the mask of ``image.jpg`` in a folder of masks: ``image.jpg.png`` (COLMAP), ``image.png`` or ``image.jpg``.
 
     The folder is next to the image or to one of the folders around it, up to the one that also holds ``source``. In it,
     a mask may have the same sub-folders as its image.

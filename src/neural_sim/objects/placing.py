@@ -26,14 +26,14 @@ AXES = {
 SMALL = 256
 """Longer side, in pixels, of the silhouettes that carve the hull."""
 NEARLY_ALL = 0.95
-"""Fraction of a photograph above which a mask is doubted."""
+"""Fraction of a photograph that a mask may cover before it is doubted."""
 CELLS = 48
 """Number of cells along each side of the cube that is carved."""
 OUTSIDE = 0.05
-"""Largest fraction of the views seeing a hull cell in which it may lie outside the silhouette: poses and masks of
-photographs are not exact."""
+"""Largest fraction of the views that see a hull cell in which it may lie outside the silhouette, because poses and
+masks of photographs are not exact."""
 SEEN_BY = 0.5
-"""Smallest fraction of all views that must see a hull cell: cells seen by few lie at the photographs' edges."""
+"""Fraction of all views that must see a hull cell; those seen by few lie at the edges of photographs."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,14 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None, box: Corner
     ``box`` bounds the hull; its sides are along the axes of the capture's frame.
 
     Raises:
-        ValueError: the masks show no object, or the visual hull is empty.
+        ValueError: the masks show no object, the visual hull is empty, or ``up`` has no direction.
     """
     capture = pictures.capture
     chosen = up if up is not None else capture.up
     if chosen is None:
         chosen = mean_up(capture)
         _log.info(
-            "%s: up is taken to be (%.3f, %.3f, %.3f), the mean of the cameras' own; objects.up says another",
+            "%s: up is assumed to be (%.3f, %.3f, %.3f), the mean of the cameras' up vectors; objects.up sets another",
             capture.name, *(np.array(chosen) / max(float(np.linalg.norm(chosen)), 1e-12)),
         )  # fmt: skip
     turn = upright(np.array(chosen, dtype=np.float64), capture.name)
@@ -150,7 +150,7 @@ def sphere_of(
     shown = [(frame, mask) for frame, mask in zip(capture.frames, silhouettes, strict=True) if mask.any()]
     ends = torch.tensor([[-math.inf] * 3, [math.inf] * 3] if box is None else box, dtype=torch.float64)
     centre, half = _first_cube(shown) if box is None else _cube_of(box)
-    # First with whole cells, so that no thin part is missed; then with cell centres, in a cube that fits.
+    # First by whole cells, so that no thin part is missed; then by their centres, in a cube that fits the first hull.
     for reach in (0.5 * np.sqrt(3.0), 0.0):
         cell = 2.0 * half / CELLS
         axis = torch.linspace(-half + 0.5 * cell, half - 0.5 * cell, CELLS, dtype=torch.float64)
@@ -161,7 +161,7 @@ def sphere_of(
         hull = cells[_carved(shown, cells, reach * cell)] if len(cells) else cells
         if not len(hull):
             raise ValueError(
-                f"{capture.source}: the silhouettes of {capture.name} share no space; check masks, poses and axes"
+                f"{capture.source}: the visual hull of {capture.name} is empty; check masks, poses and axes"
             )
         low, high = hull.amin(0) - 0.5 * cell, hull.amax(0) + 0.5 * cell
         centre = (0.5 * (low + high)).numpy()
@@ -183,7 +183,9 @@ def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, floa
     for frame, mask in shown:
         rows, columns = (np.flatnonzero(mask.any(axis).numpy()) for axis in (1, 0))
         scale = frame.lens.width / mask.shape[1]
-        ends = [scale * np.array([columns[k] + k_, rows[k] + k_]) for k, k_ in ((0, 0.0), (-1, 1.0))]
+        ends = [
+            scale * np.array([columns[end] + edge, rows[end] + edge]) for end, edge in ((0, 0.0), (-1, 1.0))
+        ]
         middle = 0.5 * (ends[0] + ends[1])
         lens = frame.lens
         local = np.array([(middle[0] - lens.cx) / lens.fx, -(middle[1] - lens.cy) / lens.fy, -1.0])

@@ -1,4 +1,4 @@
-"""Read PLY files, with one texture or several, by vertex or by corner, or with colours of vertices or faces."""
+"""Read PLY files, with textures mapped by vertex or by corner, or with colours of vertices or faces."""
 
 from __future__ import annotations
 
@@ -37,8 +37,7 @@ def ply_references(path: Path) -> list[Path]:
         texture = find_named(written, path.parent)
         if texture is None:
             raise ValueError(
-                f"the texture {written!r} is neither there nor beside it; put it there or take the comment "
-                "TextureFile out"
+                f"the texture {written!r} was not found; put it next to the file or remove the comment TextureFile"
             )
         found.append(texture)
     return found
@@ -55,27 +54,27 @@ def read_ply(path: Path) -> list[Part]:
     vertex, face = elements.get("vertex"), elements.get("face")
     vertices = _stacked(vertex, ("x", "y", "z"))
     if vertex is None or vertices is None or face is None or not face.count:
-        raise ValueError("holds no vertices with x, y, z or no faces")
+        raise ValueError("has no vertices with x, y, z, or no faces")
     corners, origin = _triangles(face, vertices)
     model = _Model(vertices, _stacked(vertex, ("nx", "ny", "nz")), corners, origin)
     uv = _coordinates(vertex, face, model)
     if textures and uv is not None:
         if (colours := _colours(vertex)) is not None and (colours != 1.0).any():
-            _log.warning("%s: the vertex colours beside its texture are left out", path)
+            _log.warning("%s: has a texture and vertex colours; the colours are left out", path)
         return _textured(model, uv, textures, face)
     if textures:
-        _log.warning("%s: has a texture and no texture coordinates, drawn without it", path)
+        _log.warning("%s: has a texture but no texture coordinates; drawn without the texture", path)
     if (colours := _colours(vertex)) is not None:
         return [Part(vertices, corners, colours, model.normals)]
     if (colours := _colours(face)) is not None:
         return [Part(vertices, corners, colours[origin[:, 0]], model.normals, by_face=True)]
-    _log.warning("%s: nothing says its colours, painted grey", path)
+    _log.warning("%s: has no colours; painted grey", path)
     return [Part(vertices, corners, np.full((len(vertices), 3), GREY[0] / 255.0), model.normals)]
 
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Triangles; ``origin`` has, for each, the polygon it is cut from and the places of its corners in that polygon."""
+    """Triangles; ``origin`` has, for each, the polygon it was cut from and the places of its corners in it."""
 
     vertices: Float[np.ndarray, "v 3"]
     normals: Float[np.ndarray, "v 3"] | None
@@ -93,7 +92,7 @@ def _triangles(
     for polygon in [polygons.reshape(-1)] if polygons.dtype != object else polygons:
         if len(polygon) and not 0 <= polygon.min() <= polygon.max() < len(vertices):
             raise ValueError(
-                f"a face names vertex {polygon.max()} or {polygon.min()}, there are {len(vertices)}"
+                f"a face refers to vertex {polygon.max()} or {polygon.min()}, but there are {len(vertices)}"
             )
     if polygons.dtype != object and polygons.shape[1] == 3:
         places = np.broadcast_to(np.arange(3), (len(polygons), 3))
@@ -105,7 +104,7 @@ def _triangles(
         for triangle in clipped(vertices[polygon])
     ]
     if not made:
-        raise ValueError("its faces have less than three corners")
+        raise ValueError("its faces have fewer than three corners")
     origin = np.array(made, dtype=np.int64)
     return np.array([polygons[row[0]][row[1:]] for row in origin], dtype=np.int64), origin
 
@@ -118,7 +117,7 @@ def _coordinates(vertex: Element, face: Element, model: _Model) -> Float[np.ndar
         for row, (number, *places) in enumerate(model.origin.tolist()):
             pairs = np.asarray(stated[number], dtype=np.float64)
             if len(pairs) % 2 or len(pairs) < 2 * (max(places) + 1):
-                raise ValueError(f"face {number} has {len(pairs)} numbers of texcoord for its corners")
+                raise ValueError(f"face {number} has {len(pairs)} texcoord numbers, want two for each corner")
             made[row] = pairs.reshape(-1, 2)[places]
         return made
     for names in _COORDINATES:
@@ -134,14 +133,16 @@ def _textured(
     number = np.zeros(len(model.corners), dtype=np.int64)
     if len(textures) > 1:
         if "texnumber" not in face.columns:
-            raise ValueError(f"names {len(textures)} textures, and no texnumber says which face has which")
+            raise ValueError(f"has {len(textures)} textures, but no texnumber says which face has which")
         number = face.columns["texnumber"][model.origin[:, 0]].astype(np.int64)
         if not ((number >= 0) & (number < len(textures))).all():
-            raise ValueError(f"texnumber goes to {number.max()}, there are {len(textures)} textures")
+            raise ValueError(
+                f"texnumber goes from {number.min()} to {number.max()}, but there are {len(textures)} textures"
+            )
     parts = []
     for index in np.unique(number).tolist():
         of = number == index
-        # Vertices are split if their corners differ in coordinates.
+        # A vertex is split if it has several texture coordinates.
         rows = np.concatenate([model.corners[of].reshape(-1, 1), uv[of].reshape(-1, 2)], -1)
         unique, faces = np.unique(rows, axis=0, return_inverse=True)
         at, white = unique[:, 0].astype(np.int64), np.ones((len(unique), 3))
@@ -158,7 +159,7 @@ def _stacked(element: Element | None, names: Sequence[str]) -> Float[np.ndarray,
 
 
 def _colours(element: Element) -> Float[np.ndarray, "n 3"] | None:
-    """Return colours, scaled to [0, 1] by their type; 32-bit integers are taken to be bytes in a wider type."""
+    """Return colours in [0, 1]; white is 65535 for ushort, 1 for floats up to 1, and 255 for everything else."""
     for names in _COLOURS:
         values = _stacked(element, names)
         if values is None:
@@ -168,6 +169,6 @@ def _colours(element: Element) -> Float[np.ndarray, "n 3"] | None:
         if kind.kind == "f" and (values > 1.0).any():
             white = 255.0
         if not (np.isfinite(values).all() and (values >= 0.0).all() and (values <= white).all()):
-            raise ValueError(f"wants {', '.join(names)} from 0 to {white:g}")
+            raise ValueError(f"want {', '.join(names)} from 0 to {white:g}")
         return values / white
     return None

@@ -1,4 +1,4 @@
-"""Read the elements of a PLY file as stored: ASCII or binary, in any byte order, with lists of any length."""
+"""Read the elements of a PLY file as stored: ASCII or binary, in either byte order, with lists of any length."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ def read_elements(path: Path) -> dict[str, Element]:
     """Read a PLY file's elements, by name.
 
     Raises:
-        ValueError: the header or the data are not those of a PLY file, or end too early.
+        ValueError: the header or the data are not a PLY file's, or end too early.
     """
     data = path.read_bytes()
     head, found, body = data.partition(_END)
     if not data.startswith(b"ply") or not found:
-        raise ValueError("has no header of a PLY file")
+        raise ValueError("has no PLY header")
     body = body.partition(b"\n")[2] if b"\n" in body[:3] else body.partition(b"\r")[2]
     lines = head.decode("utf-8", "replace").replace("\r", "\n").split("\n")
     encoding, elements = _declared(lines)
@@ -75,12 +75,12 @@ def _declared(lines: Sequence[str]) -> tuple[str, list[Element]]:
             elif words[:1] == ["property"]:
                 elements[-1].properties.append(Property(words[2], np.dtype(_TYPES[words[1]])))
         except (IndexError, KeyError, ValueError):
-            raise ValueError(f"the header has a line {line.strip()!r}") from None
+            raise ValueError(f"cannot read the header's line {line.strip()!r}") from None
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise ValueError(f"the header has the format {encoding!r}")
+        raise ValueError(f"want format ascii, binary_little_endian or binary_big_endian, got {encoding!r}")
     for element in elements:
         if not 0 <= element.count <= _MOST:
-            raise ValueError(f"the header says {element.count} of {element.name}")
+            raise ValueError(f"the header declares {element.count} rows of {element.name}, want 0 to {_MOST}")
     return encoding, elements
 
 
@@ -118,7 +118,7 @@ def _rows_of_bytes(element: Element, data: bytes, start: int, order: Order) -> i
                 element.columns[item.name] = table[f"value {number}"].astype(item.kind)
             return end
     if all(item.lengths is None for item in element.properties):
-        raise ValueError(f"is cut off: {element.count} of {element.name} do not fit")
+        raise ValueError(f"is cut off: want {element.count} rows of {element.name}, got fewer")
     return _row_by_row(element, data, start, order)
 
 
@@ -130,7 +130,7 @@ def _lengths_at(element: Element, data: bytes, start: int, order: Order) -> list
         if item.lengths is not None and element.count:
             length = int(_take(data, start, item.lengths, 1, order, element)[0])
             if length < 0:
-                raise ValueError(f"a list of {element.name} has the length {length}")
+                raise ValueError(f"a list of {element.name} has length {length}")
             start += item.lengths.itemsize
         start += item.kind.itemsize * (length if item.lengths is not None else 1)
         made.append(length)
@@ -154,7 +154,7 @@ def _row_by_row(element: Element, data: bytes, start: int, order: Order) -> int:
 
 def _take(data: bytes, start: int, kind: np.dtype, count: int, order: Order, element: Element) -> np.ndarray:
     if start + count * kind.itemsize > len(data):
-        raise ValueError(f"is cut off: {element.count} of {element.name} do not fit")
+        raise ValueError(f"is cut off: want {element.count} rows of {element.name}, got fewer")
     return np.frombuffer(data, kind.newbyteorder(order), count, start).astype(kind)
 
 
@@ -167,9 +167,9 @@ def _read_text(elements: Sequence[Element], data: bytes) -> None:
         try:
             start = _rows_of_words(element, words, start)
         except IndexError:
-            raise ValueError(f"is cut off: {element.count} of {element.name} do not fit") from None
+            raise ValueError(f"is cut off: want {element.count} rows of {element.name}, got fewer") from None
     if start < len(words):
-        raise ValueError(f"has {len(words) - start} numbers more than its header says")
+        raise ValueError(f"has {len(words) - start} more numbers than its header says")
 
 
 def _rows_of_words(element: Element, words: Sequence[bytes], start: int) -> int:
@@ -199,10 +199,10 @@ def _rows_of_words(element: Element, words: Sequence[bytes], start: int) -> int:
 def _typed(values: Shaped[np.ndarray, "n"], item: Property) -> Shaped[np.ndarray, "n"]:
     """Return numbers in a property's type, which must hold them."""
     if item.kind.kind == "f":
-        return values  # with all digits of the text
+        return values  # in double precision, to keep all digits of the text
     limits = np.iinfo(item.kind)
     if not ((values >= limits.min) & (values <= limits.max) & (values == np.rint(values))).all():
-        raise ValueError(f"{item.name} has a value that its type {item.kind} does not hold")
+        raise ValueError(f"{item.name} has a value that its type {item.kind} cannot hold")
     return values.astype(item.kind)
 
 

@@ -1,4 +1,4 @@
-"""Triangulation of polygons in files."""
+"""Triangulation of polygons."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def clipped(corners: Float[np.ndarray, "n 3"]) -> list[tuple[int, int, int]]:
             if _is_ear(corners[a], corners[b], corners[c], others, normal):
                 break
         else:
-            place = 0  # a polygon that crosses itself has no ears
+            place = 0  # a polygon that crosses itself may have no ears
         made.append((left[place - 1], left[place], left[(place + 1) % len(left)]))
         del left[place]
     return [*made, (left[0], left[1], left[2])]

@@ -19,16 +19,15 @@ HUGE_FACES = 500_000
 LEAST_VERTICES = 50
 """Number of vertices below which a tip far from the others may be intended."""
 OUTLIER = 1.5
-"""Distance of an outlier as a multiple of any other's; YCB scans have up to 1.003."""
+"""Ratio of an outlier's distance from the middle to the next largest; YCB scans have up to 1.003."""
 
 
 def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     """Copy a mesh so that it can be rendered, and log every repair as a warning.
 
-    The copy has finite normals, no degenerate faces, and colours.
-
-    Normals that are not finite are recomputed from the faces. A mesh without colours, or with a missing texture, gets
-    its material's colour or grey. More than ``HUGE_FACES`` faces only give a warning.
+    The copy has no degenerate faces, finite normals, and colours. If a normal is not finite or too short, all are
+    recomputed from the faces. A mesh without colours, or with a missing texture, gets its material's colour or grey.
+    More than ``HUGE_FACES`` faces only give a warning.
 
     Raises:
         ValueError: no face has positive area and finite vertices; the message has ``source``.
@@ -39,7 +38,7 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     _warn_of_outlier(np.asarray(mesh.vertices), name, source)
     if len(mesh.faces) > HUGE_FACES:
         log.warning(
-            "%s: object %r has %d faces; more than %d draw slowly, decimate it if views take long",
+            "%s: object %r has %d faces; more than %d are slow to draw, decimate it if views take long",
             source, name, len(mesh.faces), HUGE_FACES,
         )  # fmt: skip
     mesh = _with_finite_normals(mesh, name, source)
@@ -47,7 +46,7 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
 
 
 def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
-    mesh = mesh.copy(include_cache=True)  # the cache has the file's normals
+    mesh = mesh.copy(include_cache=True)  # the file's normals are in the cache
     vertices = np.asarray(mesh.vertices)
     good = np.isfinite(vertices[mesh.faces].sum(axis=(1, 2)))
     if good.any():
@@ -75,7 +74,7 @@ def _warn_of_outlier(vertices: Float[np.ndarray, "v 3"], name: str, source: str)
     others = away[(vertices != vertices[farthest]).any(axis=1)]
     if len(vertices) >= LEAST_VERTICES and len(others) and away[farthest] > OUTLIER * others.max():
         log.warning(
-            "%s: object %r: the vertex %s is %.3g times as far from the middle as any other; is a digit of it wrong?",
+            "%s: object %r: the vertex %s is %.3g times as far from the middle as any other; is a digit wrong?",
             source, name, vertices[farthest].tolist(), away[farthest] / others.max(),
         )  # fmt: skip
 
@@ -86,10 +85,10 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
     if not bad.any():
         return mesh
     log.warning(
-        "%s: object %r: %d of %d normals were not of finite unit length, recomputed",
+        "%s: object %r: %d of %d normals were not of unit length; all are recomputed",
         source, name, int(bad.sum()), len(bad),
     )  # fmt: skip
-    # A new mesh has none of the file's normals, so that trimesh computes them from the faces.
+    # A new mesh has none of the file's normals, so trimesh computes them from the faces.
     rebuilt = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     rebuilt.visual = copy.deepcopy(mesh.visual)
     fresh = np.array(rebuilt.vertex_normals)
@@ -114,13 +113,13 @@ def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trime
         if image is not None and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
             visual.uv = _finite_uv(np.asarray(visual.uv), name, source)
             return mesh
-        if np.asarray(material.main_color)[:3].any():  # files without any colour would come out black
+        if np.asarray(material.main_color)[:3].any():  # black means that the file gives no colour
             paint = tuple(int(value) for value in np.asarray(material.main_color)[:4])
-        log.warning("%s: object %r: no texture to draw (missing?), painted plain %s", source, name, paint[:3])
+        log.warning("%s: object %r: no texture (is it missing?); painted plain %s", source, name, paint[:3])
     elif isinstance(visual, ColorVisuals) and visual.kind in ("vertex", "face"):
         return mesh
     else:
-        log.warning("%s: object %r has no colours, painted grey", source, name)
+        log.warning("%s: object %r has no colours; painted grey", source, name)
     colours = np.tile(np.array(paint, dtype=np.uint8), (len(mesh.vertices), 1))
     mesh.visual = ColorVisuals(mesh, vertex_colors=colours)
     return mesh
@@ -130,7 +129,7 @@ def _finite_uv(uv: Float[np.ndarray, "v 2"], name: str, source: str) -> Float[np
     finite = np.all(np.isfinite(uv), axis=1)
     if not finite.all():
         log.warning(
-            "%s: object %r: %d of %d texture coordinates are not finite, set to 0",
+            "%s: object %r: %d of %d texture coordinates are not finite; set to 0",
             source, name, int((~finite).sum()), len(uv),
         )  # fmt: skip
     return np.where(finite[:, None], uv, 0.0)

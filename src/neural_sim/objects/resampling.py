@@ -37,7 +37,7 @@ def shared_camera(poses: Float[np.ndarray, "n 4 4"], image_size: int, name: str)
     nearest = float(np.linalg.norm(poses[:, :3, 3], axis=-1).min())
     if nearest <= 1.02:
         raise ValueError(
-            f"{name}: a camera {nearest:.3g} object radii from the object's middle is inside of it; "
+            f"{name}: a camera {nearest:.3g} object radii from the object's middle is inside it; "
             "check the masks"
         )
     tangent = MARGIN / math.sqrt(nearest**2 - 1.0)
@@ -62,7 +62,8 @@ def resample(
 ) -> PosedViews:
     """Make views of these frames in the object's frame, in their order.
 
-    A pixel is the mean of samples at the photograph's resolution; it is ``known`` if all of them lie in the photograph.
+    A pixel is the mean of samples about as dense as the photograph's pixels; it is ``known`` if all of them lie in the
+    photograph.
     """
     poses = np.stack([placement.pose(frame.camera_to_world) for frame in frames])
     camera = shared_camera(poses, image_size, pictures.capture.name)
@@ -76,7 +77,7 @@ def resample(
 
 
 def pixels_per_pixel(frame: Frame, camera: PinholeCamera) -> float:
-    """Return the number of the photograph's pixels along a side of one pixel of the views."""
+    """Return how many of the photograph's pixels fit along the side of one pixel of the views."""
     return max(frame.lens.fx, frame.lens.fy) / focal_length(camera)
 
 

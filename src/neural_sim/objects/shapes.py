@@ -27,11 +27,11 @@ class Part:
 def revolve(
     profile: list[tuple[float, float]], side: Print, cap: Print, segments: int = 64, rows: int = 6
 ) -> list[Part]:
-    """Make a solid of revolution from a profile of (radius, z) about the z axis, one part for each straight piece.
+    """Revolve a profile of (radius, z) about the z axis, with one part for each straight piece.
 
     The profile runs anticlockwise, seen with radius to the right and z up: from the bottom's centre outwards, up the
-    side, back to the axis. Steep pieces take ``side`` (x: azimuth, 0.5 at world +x and growing towards +y; y:
-    height over the profile's range), flat ones ``cap``, seen from outside (image right is +y).
+    side, back to the axis. Steep pieces are printed with ``side`` (x: azimuth, 0.5 at world +x and growing towards +y;
+    y: height over the profile's range), flat ones with ``cap``, seen from outside (image right is +y).
     """
     heights = [z for _, z in profile]
     low, span = min(heights), max(max(heights) - min(heights), 1e-9)
@@ -73,7 +73,7 @@ def box(
 
 
 def tube(path: Float[np.ndarray, "n 3"], radius: float, panel: Print, sides: int = 16) -> list[Part]:
-    """Make a round rod along a planar path in the x-z plane, closed at both ends."""
+    """Make a round rod along a path in the x-z plane, closed at both ends."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.array([0.0, 1.0, 0.0])

@@ -16,15 +16,15 @@ from neural_sim.pictures import read_picture
 LONGER = 200
 """Longer side, in pixels, at which photographs are compared."""
 TEXTURE = 0.03
-"""Smallest contrast with its surroundings (relative to white) of a pixel that could show the camera's motion."""
+"""Contrast of a pixel with its surroundings, relative to white, above which it could show the camera's motion."""
 CHANGE = 0.35
 """Largest change of a standing pixel from its usual value, relative to its contrast: exposure and noise change less."""
 STILL = 0.8
 """Fraction of the photographs in which a standing pixel has its usual value."""
 LEAST_SHARE = 0.15
-"""Smallest fraction of textured pixels that stand still; less is a speck on the lens, or chance."""
+"""Smallest fraction of textured pixels that must stand still; less is a speck on the lens, or chance."""
 AROUND = 5
-"""Distance in pixels around which contrast is measured."""
+"""Standard deviation in pixels of the Gaussian that gives a pixel's surroundings."""
 
 
 def standing_parts(shots: Sequence[Shot]) -> dict[Path, Bool[np.ndarray, "_ _"]] | None:

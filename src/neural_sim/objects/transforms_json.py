@@ -1,4 +1,4 @@
-"""Captures as ``transforms.json``: nerfstudio's, instant-ngp's, and NeRF-synthetic's with three files."""
+"""Captures from ``transforms.json``: nerfstudio's, instant-ngp's, and NeRF-synthetic's three files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = ("transforms.json", "transforms_train.json", "transforms_val.json", "tra
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")
 PARTS = ("train", "val", "test")
 HELD_OUT = "held out"
-"""Key for the files of scoring frames, in addition to what the file itself holds."""
+"""Key that is added to a document, for the names of its test frames."""
 POSE = "transform_matrix"
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "k5", "k6")
@@ -35,7 +35,7 @@ def read_transforms(folder: Path, name: str) -> Capture:
     """Read the capture of a folder.
 
     It has ``transforms.json``, or ``transforms_train.json`` with optional ``_val`` and ``_test`` files, whose frames
-    are test frames. The latter kind is Blender's, with +z up. A frame's intrinsics override the file's. Frames whose
+    are test frames. The latter layout is Blender's, with +z up. A frame's intrinsics override the file's. Frames whose
     image is missing or whose pose is null are left out with a warning.
 
     Raises:
@@ -79,7 +79,7 @@ def _read(path: Path) -> dict[str, Any]:
     first: dict[str, int] = {}
     for number, entry in enumerate(document["frames"]):
         if not isinstance(entry, dict):
-            continue  # refused where it is read
+            continue  # ``_frame`` refuses it
         for key in ("file_path", "mask_path"):
             if isinstance(entry.get(key), str):
                 entry[key] = entry[key].replace("\\", "/")
@@ -90,7 +90,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Drop nulls, and give the file's focal lengths and angles to the frames that have none of their own."""
+    """Drop nulls, and copy the file's focal lengths and angles to frames that have none of their own."""
     common = {key: value for key, value in document.items() if value is not None}
     focal = {key: common.pop(key) for key in FOCAL if key in common}
     frames = []
@@ -104,7 +104,7 @@ def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> dict[str, Any]:
-    """Apply nerfstudio's lists of files: ``val`` and ``test`` are test frames, files in no list are left out."""
+    """Apply nerfstudio's lists: ``val`` and ``test`` list test frames; with a list ``train``, others are left out."""
     lists = {part: document[f"{part}_filenames"] for part in PARTS if f"{part}_filenames" in document}
     if not lists:
         return document
@@ -122,7 +122,7 @@ def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> 
         e for e in document["frames"] if not isinstance(e, dict) or str(e.get("file_path")) not in others
     ]
     counts = ", ".join(f"{part} {len(names)}" for part, names in lists.items())
-    _log.info("%s: frames as its lists of file names say (%s)", path, counts)
+    _log.info("%s: frames are split as its lists of file names say (%s)", path, counts)
     if len(frames) < len(document["frames"]):
         left = len(document["frames"]) - len(frames)
         _log.warning("%s: %d frames are in none of its lists of file names and are left out", path, left)
@@ -153,7 +153,7 @@ def _frame(
         raise ValueError(f"{where}: want a file_path, got {entry!r}")
     where = f"{where} ({entry['file_path']})"
     if POSE not in entry:
-        raise ValueError(f"{where}: has no pose; want a {POSE}, null where none was found")
+        raise ValueError(f"{where}: has no pose; want a {POSE}, null if none was found")
     if entry[POSE] is None:
         return None
     pose = checked_pose(entry[POSE], f"{where}: {POSE}")
@@ -191,7 +191,7 @@ def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
     stated = round(number("w", width)), round(number("h", height))
     if stated != header.stored:
         raise ValueError(
-            f"{where}: the image has {by(header.stored)} pixels, its intrinsics w and h say "
+            f"{where}: the image has {by(header.stored)} pixels, but its intrinsics w and h say "
             f"{by(stated)}{header.turning}"
         )
     model = values.get("camera_model", "OPENCV")
@@ -202,7 +202,9 @@ def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
         )
     strange = [key for key in OTHER_LENSES if values.get(key)]
     if strange:
-        raise ValueError(f"{where}: {strange[0]}: lenses with it are not read; undistort the photographs")
+        raise ValueError(
+            f"{where}: {strange[0]}: lenses with this key are not supported; undistort the photographs"
+        )
     if "fl_x" not in values and "camera_angle_x" not in values:
         raise ValueError(f"{where}: want intrinsics fl_x or camera_angle_x, of the frame or of the file")
     fx = number("fl_x", 0.0) if "fl_x" in values else focal("camera_angle_x", width)
@@ -214,8 +216,8 @@ def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
     cx, cy = number("cx", 0.5 * width), number("cy", 0.5 * height)
     if "w" not in values and "h" not in values and not (0.0 < cx < width and 0.0 < cy < height):
         raise ValueError(
-            f"{where}: cx and cy ({cx:g}, {cy:g}) are outside of the image's {by(header.stored)} pixels; its "
-            "intrinsics are of another size: want w and h"
+            f"{where}: cx and cy ({cx:g}, {cy:g}) are outside the image's {by(header.stored)} pixels; its "
+            "intrinsics are for another size: want w and h"
         )
     radial = tuple(number(f"k{i}", 0.0) for i in (1, 2, 3, 4))
     tangential = (number("p1", 0.0), number("p2", 0.0))

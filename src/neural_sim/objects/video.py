@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 JUDGED_AT = 640
-"""Longer side in pixels of the frames whose sharpness is compared: finer detail is noise."""
+"""Longer side in pixels at which the sharpness of frames is compared; finer detail is noise."""
 
 
 def videos_of(folder: Path) -> list[Path]:
@@ -44,17 +44,17 @@ def take_frames(folder: Path, name: str, count: int) -> None:
         return
     if len(videos) > 1:
         raise ValueError(
-            f"{folder}: want one video, got {len(videos)}: {', '.join(video.name for video in videos)}; an object has "
-            "a folder and a video of its own"
+            f"{folder}: want one video, got {len(videos)}: {', '.join(video.name for video in videos)}; give "
+            "each object a folder with one video"
         )
     require("video", f"objects.root: {videos[0]}")
     images = folder / FOLDER
     try:
-        place = Path(tempfile.mkdtemp(prefix=f"._{FOLDER}-", dir=folder))  # remains if a run is killed
+        place = Path(tempfile.mkdtemp(prefix=f"._{FOLDER}-", dir=folder))  # is left behind if a run is killed
     except OSError as error:
         raise ValueError(
             f"{folder}: frames of {videos[0].name} cannot be written into it ({error.strerror}); copy the video to a "
-            "folder that can be written"
+            "writable folder"
         ) from error
     try:
         for number, picture in _sharpest(videos[0], count):
@@ -65,8 +65,8 @@ def take_frames(folder: Path, name: str, count: int) -> None:
     finally:
         shutil.rmtree(place, ignore_errors=True)
     _log.info(
-        "%s: %d frames of %s are taken, the sharpest of as many equal parts; they are in %s, objects.frames takes "
-        "others once that is deleted", name, taken, videos[0].name, images,
+        "%s: took %d frames of %s, the sharpest of as many equal parts, and wrote them to %s; to take another number "
+        "(objects.frames), delete that folder", name, taken, videos[0].name, images,
     )  # fmt: skip
 
 
@@ -77,20 +77,20 @@ def _sharpest(video: Path, count: int) -> Iterator[tuple[int, Image.Image]]:
     try:
         with av.open(video) as container:
             if not container.streams.video:
-                raise ValueError(f"{video}: holds no pictures")
+                raise ValueError(f"{video}: has no video stream")
             total = sum(packet.size > 0 for packet in container.demux(video=0))
         with av.open(video) as container:
             frames = enumerate(container.decode(video=0))
             for _, part in groupby(frames, lambda numbered: numbered[0] * count // max(count, total)):
                 number, frame = max(part, key=lambda numbered: _sharpness(numbered[1]))
-                # Phones store pictures as the sensor sees them, and the angle by which a player should rotate them.
+                # Phones store frames as the sensor sees them, with the angle by which a player should rotate them.
                 yield number, frame.to_image().rotate(frame.rotation, expand=True)
     except av.FFmpegError as error:
         raise ValueError(f"{video}: cannot be read as a video: {error.strerror}") from error
 
 
 def _sharpness(frame: Any) -> float:
-    """Return the mean square of a frame's second derivatives."""
+    """Return the mean square of a frame's Laplacian."""
     part = min(1.0, JUDGED_AT / max(frame.width, frame.height))
     grey = frame.reformat(round(part * frame.width), round(part * frame.height), "gray").to_ndarray()
     return float(np.square(laplace(grey.astype(np.float32))).mean())

@@ -57,7 +57,7 @@ def obj_references(path: Path) -> list[Path]:
 
 
 def read_obj(path: Path) -> list[Part]:
-    """Read the parts of an OBJ file, one for each material.
+    """Read the parts of an OBJ file: for each material, the faces with and those without texture coordinates.
 
     Raises:
         ValueError: a line cannot be read, an index points to nothing, or a material or texture is missing.
@@ -88,13 +88,15 @@ def read_obj(path: Path) -> list[Part]:
                 uv = _coordinates(coordinates)[rows[:, 1]] * material.scale + material.offset
             elif material.texture is not None:
                 _log.warning(
-                    "%s: %d faces of material %r have no coordinates in its texture %s and take its plain colour",
+                    "%s: %d faces of material %r have no coordinates in its texture %s and get its plain colour",
                     path, len(corners), name, material.texture.name,
                 )  # fmt: skip
             if texture is not None or colours is None:
                 paint = np.broadcast_to(_colour(material, texture, name, path), (len(at), 3))
             if texture is not None and colours is not None and (colours[at] != 1.0).any():
-                _log.warning("%s: the vertex colours beside texture %s are left out", path, material.texture)
+                _log.warning(
+                    "%s: vertex colours of faces with the texture %s are left out", path, material.texture
+                )
             own = normals[rows[:, 2]] if rows[0, 2] >= 0 else None
             parts.append(Part(vertices[at], faces.reshape(-1, 3), paint, own, uv, texture))
     return parts
@@ -104,11 +106,11 @@ def _colour(material: Material, texture: Texture | None, name: str | None, path:
     if texture is None:
         if material.colour is not None:
             return np.array(material.colour)
-        _log.warning("%s: nothing says the colour of material %r, painted grey", path, name)
+        _log.warning("%s: material %r has no colour; painted grey", path, name)
         return np.array(GREY[:3]) / 255.0
     if material.colour is None or not any(material.colour):
         if material.colour is not None:
-            _log.warning("%s: material %r has Kd 0 0 0 beside a texture, taken as white", path, name)
+            _log.warning("%s: material %r has a texture and Kd 0 0 0, which is read as white", path, name)
         return np.ones(3)
     return np.array(material.colour)
 
@@ -121,7 +123,7 @@ def _material(
     faces: int,
     coloured: bool,
 ) -> Material:
-    """Return the material with this name; log which one is used for faces without a material."""
+    """Return the material with this name; for faces without a material, the only one (logged), or a plain one."""
     if name in materials:
         return materials[name]
     if coloured:
@@ -129,7 +131,7 @@ def _material(
     if name is None or name.lower() in _NO_MATERIAL:
         if name is None and len(materials) == 1:
             only = next(iter(materials))
-            _log.warning("%s: no usemtl before %d faces; they have the only material, %r", path, faces, only)
+            _log.warning("%s: no usemtl before %d faces; they get the only material, %r", path, faces, only)
             return materials[only]
         return Material()
     known = ", ".join(repr(other) for other in materials) or "none"
@@ -150,7 +152,7 @@ def _libraries(text: str, path: Path) -> list[Path]:
             continue
         several = [find_named(name, path.parent) for name in written.split()]
         if None in several:
-            _log.warning("%s: mtllib %s is not there", path, written)
+            _log.warning("%s: mtllib %s does not exist", path, written)
         found += [library for library in several if library is not None]
     return list(dict.fromkeys(found))
 
@@ -185,7 +187,7 @@ def _kd(rest: str, where: str) -> tuple[float, float, float]:
 
 
 def _map(material: Material, rest: str, library: Path, where: str) -> None:
-    """Read ``map_Kd`` with its options; a file named by the whole text has priority."""
+    """Read ``map_Kd`` with its options; if the whole text, without options, is the name of a file, it is that file."""
     found = find_named(rest, library.parent) if not rest.startswith("-") else None
     if found is None:
         words = rest.split()
@@ -208,14 +210,14 @@ def _map(material: Material, rest: str, library: Path, where: str) -> None:
         found = find_named(written, library.parent)
         if found is None:
             raise ValueError(
-                f"{where}: the texture {written!r} is neither there nor beside {library.name}; put it there or "
-                "take map_Kd out"
+                f"{where}: the texture {written!r} was not found; put it next to {library.name} or "
+                "remove map_Kd"
             )
     material.texture = found
 
 
 def _leading_numbers(words: list[str]) -> list[float]:
-    """Remove up to three numbers from the front."""
+    """Remove up to three numbers from the front, and return them; [1.0] if there are none."""
     values: list[float] = []
     while len(words) > 1 and len(values) < 3:  # the last word is the file's name
         try:
@@ -281,9 +283,9 @@ def _corners(words: Sequence[str], model: _Model, where: str) -> Iterator[Corner
                     if value == 0 or made[place] < 0:
                         raise ValueError
         except (ValueError, IndexError):
-            raise ValueError(f"{where}: {word!r} is no corner of a face") from None
+            raise ValueError(f"{where}: {word!r} is not a corner of a face") from None
         if made[0] < 0:
-            raise ValueError(f"{where}: {word!r} names no vertex")
+            raise ValueError(f"{where}: {word!r} has no vertex")
         yield made[0], made[1], made[2]
 
 
@@ -297,7 +299,7 @@ def _numbers(rows: Sequence[Sequence[str]], least: int, key: str) -> Float[np.nd
     try:
         return np.array([row[:width] for row in rows], dtype=np.float64)
     except ValueError as error:
-        raise ValueError(f"a {key} has something else than numbers ({error})") from None
+        raise ValueError(f"a {key} line has something other than numbers ({error})") from None
 
 
 def _positions(model: _Model, path: Path) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"] | None]:
@@ -307,11 +309,11 @@ def _positions(model: _Model, path: Path) -> tuple[Float[np.ndarray, "v 3"], Flo
     if not coloured:
         return vertices, None
     if coloured < len(vertices):
-        _log.warning("%s: %d of %d vertices have a colour: left out", path, coloured, len(vertices))
+        _log.warning("%s: colours left out: only %d of %d vertices have one", path, coloured, len(vertices))
         return vertices, None
     colours = _numbers([row[3:6] for row in model.vertices], 3, "v")
     if not (np.isfinite(colours).all() and (colours >= 0.0).all() and (colours <= 255.0).all()):
-        raise ValueError("want colours of vertices from 0 to 1, or from 0 to 255")
+        raise ValueError("want vertex colours from 0 to 1, or from 0 to 255")
     return vertices, colours / 255.0 if (colours > 1.0).any() else colours
 
 
@@ -328,7 +330,7 @@ def _triangles(polygons: list[list[Corner]], vertices: Float[np.ndarray, "v 3"])
             continue
         at = [corner[0] for corner in polygon]
         if max(at) >= len(vertices):
-            raise ValueError(f"a face names vertex {max(at) + 1}, there are {len(vertices)}")
+            raise ValueError(f"a face refers to vertex {max(at) + 1}, but there are {len(vertices)}")
         made += [(polygon[a], polygon[b], polygon[c]) for a, b, c in clipped(vertices[at])]
     return np.array(made, dtype=np.int64)
 
@@ -350,4 +352,4 @@ def _check_indices(corners: Int[np.ndarray, "f 3 3"], counts: tuple[int, int, in
     for place, (what, count) in enumerate(zip(("vertex", "vt", "vn"), counts, strict=True)):
         most = int(corners[:, :, place].max()) + 1
         if most > count:
-            raise ValueError(f"a face names {what} {most}, there are {count}")
+            raise ValueError(f"a face refers to {what} {most}, but there are {count}")

@@ -9,14 +9,14 @@ from neural_sim.ranges import validated
 
 LAYOUT = "<id>_<name>/google_16k/textured.obj"
 ORIGIN = (
-    "get the google_16k meshes of the YCB Object and Model Set (ycbbenchmarks.com), put them there or set "
+    "get the google_16k meshes of the YCB Object and Model Set (ycbbenchmarks.com), and put them there or set "
     "objects.root"
 )
 
 
 @validated
 class YCB(MeshFiles):
-    """Objects of a folder in the YCB layout, with the names of their folders.
+    """Objects of a folder in the YCB layout, named after their folders.
 
     Args:
         root: the folder.
