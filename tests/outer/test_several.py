@@ -182,5 +182,5 @@ def test_images_are_made_again_of_one_objects_maps(several):
 
 
 def test_an_image_shows_each_object_once_at_most(several):
-    with pytest.raises(ValueError, match="at most the 3 objects"):
+    with pytest.raises(ValueError, match="at most 3, the number of objects"):
         several((1, 4)).training_set(PSI, 4, torch.Generator())

@@ -65,5 +65,5 @@ def test_ranges_that_are_none_are_refused(bad):
 
 
 def test_more_objects_than_classes_are_refused():
-    with pytest.raises(ValueError, match="at most the 2 objects"):
+    with pytest.raises(ValueError, match="at most 2, the number of objects"):
         draw_layout(own_labels([1, 1]), 2, ObjectCount(1, 3), torch.Generator())

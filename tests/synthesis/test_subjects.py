@@ -116,7 +116,7 @@ def test_what_a_subject_has_not_is_refused_by_its_name():
             _ = scene(subjects=subjects).fields
     with pytest.raises(ValueError, match="b: pictures are not drawn by bins"):
         scene(subjects=pictures()).probes(1, "pose", 2, PSI, torch.Generator())
-    with pytest.raises(ValueError, match="a: want one fixed light"):
+    with pytest.raises(ValueError, match="a: its mesh has one fixed light"):
         MeshSubject("a", None, None).maps(CAMERA, torch.eye(4)[None], torch.ones(1, 3))
     metres = SceneDistribution.of([Pose(bins=4)], Unlearned(distance=(0.5, 0.7), distance_unit="metres"))
     with pytest.raises(ValueError, match="nothing says that of a, b"):

@@ -1,4 +1,4 @@
-"""From objects rendered alone to labelled images of one or more of them, which can be composed again."""
+"""From objects rendered alone to labelled images of one or more, which can be composed again from other renders."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Compose = Callable[[Float[Tensor, "m h w 3"], Float[Tensor, "m h w"]], LabelledI
 
 @dataclass(frozen=True)
 class RenderedObject:
-    """One object alone, m times: premultiplied colour and opacity, and the scene parameters of each render.
+    """m renders of one object alone: premultiplied colour and opacity, and the scene parameters of each render.
 
-    ``noise`` reproduces the draw; it is None for renders from a pool or of probes. ``relaxed`` is None for hard draws.
-    ``tangents``, if rendered, are the maps' derivatives by the named numbers of the draw.
+    ``noise`` reproduces the draw; it is None if that is not possible, as for pools, probes and pictures. ``relaxed`` is
+    None for hard draws. ``tangents``, if rendered, are the maps' derivatives by the named numbers of the draw.
     """
 
     draw: SceneDraw
@@ -54,7 +54,7 @@ class RenderedObject:
 class RenderedImages:
     """Labelled images with the renders they are made of, class by class.
 
-    ``rows[c]`` are the images of ``objects[c]``, each of which shows it at most once. ``compose[c]`` makes these images
+    ``rows[c]`` are the images that show ``objects[c]``, one for each of its renders. ``compose[c]`` makes these images
     again from other maps of that object, with everything else unchanged; it is differentiable in the maps.
     """
 
@@ -67,9 +67,9 @@ class RenderedImages:
         return len(self.images)
 
     def without_maps(self) -> RenderedImages:
-        """Return the images without the maps that compose them again, which take more memory than the images.
+        """Return the images without the maps they were composed of, which take more memory than the images.
 
-        Empty maps remain in their place. They are clones, because an empty view would keep all of the memory.
+        Empty maps replace them. They are clones, because an empty view would keep all of the memory.
         """
         objects = tuple(
             replace(part, rgb=part.rgb[:0].clone(), opacity=part.opacity[:0].clone()) for part in self.objects
@@ -83,7 +83,7 @@ def one_each(
     labels: Sequence[int],
     synthesizer: Synthesizer,
 ) -> RenderedImages:
-    """Compose one image of every render, object by object; ``labels`` are the objects' classes."""
+    """Compose one image from every render, object by object; ``labels`` are the objects' classes."""
     images, rows, compose, first = [], [], [], 0
     for part, nuisance, label in zip(objects, nuisances, labels, strict=True):
 
@@ -106,7 +106,7 @@ def one_each(
 
 @dataclass(frozen=True)
 class Shared:
-    """Images of several objects. ``place[i, l]`` is the render that is layer l of image i, -1 for none."""
+    """Images of several objects. ``place[i, l]`` is the number of the render in layer l of image i, -1 for none."""
 
     objects: tuple[RenderedObject, ...]
     layout: Layout
@@ -128,7 +128,7 @@ class Shared:
         for label, part in enumerate(objects):
             rows, columns = layout.places(label)
             if len(rows) != len(part):
-                raise ValueError(f"layout: shows class {label} {len(rows)} times, got {len(part)} renders")
+                raise ValueError(f"layout: want {len(rows)} renders of class {label}, got {len(part)}")
             place[rows, columns] = torch.arange(len(rows))
             mine = columns == 0
             own[rows[mine]] = part.bins[mine].to(own)
@@ -150,7 +150,7 @@ class Shared:
     def images(
         self, rows: Int[Tensor, "m"], columns: Int[Tensor, "m"] | None = None, maps: Maps | None = None
     ) -> LabelledImages:
-        """Compose the images ``rows``; ``maps`` replace their layers ``columns``."""
+        """Compose the images ``rows``; ``maps``, if given, replace layer ``columns[i]`` of the i-th."""
         labels, place = self.layout.labels[rows], self.place[rows]
         like = self.objects[0]
         size = (*place.shape, *like.opacity.shape[1:])

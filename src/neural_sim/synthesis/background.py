@@ -19,7 +19,7 @@ from neural_sim.objects.files import content_digest
 from neural_sim.pictures import PHOTO_SUFFIXES, check_headers, picture_files, read_picture
 from neural_sim.ranges import Fraction, NonNegative, NonNegativeInt, PositiveFraction, PositiveInt, validated
 
-# Images processed together: few enough to stay in the cache. It is not a setting, because seeds depend on it.
+# Images drawn together: few enough to stay in the cache. Not a setting, because what a seed draws depends on it.
 CHUNK = 16
 
 
@@ -45,7 +45,7 @@ class ProceduralClutter:
     Args:
         octaves: octaves of noise, from 2 cells across the image and doubling.
         contrast: amplitude of the noise.
-        shapes: shapes in an image, drawn from far to near.
+        shapes: number of shapes in an image, drawn from far to near.
         distractors: fraction of shapes that are saturated red or blue, so that no object can be found by colour alone.
         grain: standard deviation of pixel noise.
     """
@@ -103,7 +103,7 @@ class ProceduralClutter:
             yield from ((12, n, 1, 1), (5, n))
 
     def _wall(self, numbers: Sequence[Tensor], height: int, width: int) -> Tensor:
-        """Draw a random colour with noise of every scale, mostly grey in hue."""
+        """Draw a random colour with noise of every scale, mostly grey."""
         base, tint = 0.2 + 0.6 * numbers[0], 0.25 * (numbers[1] - 0.5)
         images = (base + tint).expand(-1, -1, height, width).clone()
         for octave in range(self.octaves):
@@ -154,7 +154,7 @@ class PhotoFolder:
     ``smallest`` is the side of the smallest crop relative to the largest.
 
     Raises:
-        ValueError: the folder does not exist or has no photograph, or a file in it is not an image by its header.
+        ValueError: the folder does not exist or has no photograph, or a file's header cannot be read.
     """
 
     def __init__(self, root: str | Path, smallest: PositiveFraction = 0.4) -> None:
@@ -174,7 +174,11 @@ class PhotoFolder:
         generator: torch.Generator,
         device: torch.device | str = "cpu",
     ) -> Float[Tensor, "n 3 height width"]:
-        """Draw ``n`` crops, float32. Raises ``ValueError``, with the file, for a file that cannot be read."""
+        """Draw ``n`` crops, float32.
+
+        Raises:
+            ValueError: a photograph cannot be read; the message has its file.
+        """
         chosen = torch.randint(len(self.files), (n,), generator=generator).tolist()
         uniform = torch.rand((n, 3), generator=generator, dtype=torch.float64).tolist()
         images = torch.empty(n, 3, height, width)

@@ -44,7 +44,7 @@ def apply_shift(image: Float[Tensor, "n h w *c"], shift: Int[Tensor, "n 2"]) -> 
     source = rows.clamp(0, height - 1)[:, :, None] * width + columns.clamp(0, width - 1)[:, None]
     pixels = image.reshape(n, height * width, -1)
     moved = pixels.gather(1, source.reshape(n, -1, 1).expand(-1, -1, pixels.shape[-1]))
-    # where instead of a product: a NaN at the image's edge must not enter from outside.
+    # ``where`` instead of a product, which would spread a NaN at the image's edge.
     return torch.where(inside.reshape(n, -1, 1), moved, 0.0).reshape(image.shape)
 
 

@@ -1,4 +1,4 @@
-"""Distractors: things of no class, cut out of pictures with an alpha channel, behind and in front of the objects."""
+"""Distractors: unlabelled cut-outs of pictures with an alpha channel, behind and in front of the objects."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Distractors:
         root: a folder with pictures that have an alpha channel (png, webp, tif); None: no distractors.
         count: smallest and largest number in an image.
         size: smallest and largest longer side, as a fraction of the image's shorter side.
-        front: probability that one is in front of the objects, which it then hides.
+        front: probability that a distractor is in front of the objects and hides what is behind it.
 
     Raises:
-        ValueError: the folder does not exist or has no picture, or a file's header shows no picture with an alpha
-            channel.
+        ValueError: the folder does not exist or has no picture, or a file is not a picture with an alpha channel
+            according to its header.
     """
 
     root: str | Path | None = None
@@ -86,7 +86,7 @@ class Distractors:
 
     @cached_property
     def files(self) -> list[Path]:
-        """The pictures, by name."""
+        """The pictures, sorted by name."""
         if self._folder is None:
             return []
         return picture_files(self._folder, CUTOUT_SUFFIXES)
@@ -106,7 +106,7 @@ class Distractors:
     ) -> tuple[Cover, Cover] | None:
         """Draw the distractors behind the objects of n images, and those in front of them.
 
-        Without distractors both are None, and no random number is drawn.
+        Without distractors, return None and draw no random number.
 
         Raises:
             ValueError: a picture cannot be read; the message has its file.

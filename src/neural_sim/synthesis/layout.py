@@ -1,7 +1,7 @@
 """Which objects share an image, and which is in front: not part of p_psi, and drawn before anything is rendered.
 
-The number of objects in an image is uniform in a range, and their classes differ; each set of classes is equally
-likely. Every image has one class of its own, so that all classes get equally many; the others follow at random.
+The number of objects in an image is uniform in a range. Their classes differ, and each set of a given size is equally
+likely. Every image has a class of its own, so that all classes get equally many images; the others follow at random.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class ObjectCount:
 
     @property
     def mean(self) -> float:
-        """Return the mean number of objects in an image."""
+        """Mean number of objects in an image."""
         return 0.5 * (self.fewest + self.most)
 
     def draw(self, n: int, generator: torch.Generator, present: bool = False) -> Int[Tensor, "n"]:
@@ -52,8 +52,8 @@ class ObjectCount:
 class Layout:
     """The classes of n images, and which object is in front.
 
-    ``labels`` are the classes in each image, -1 for none; column 0 has the image's own class. Of objects at equal
-    distances, the one with the smaller ``order``, in [0, 1), is in front.
+    ``labels`` are the classes in each image, -1 for none; column 0 has the image's own class. If two objects are
+    equally distant, the one with the smaller ``order``, in [0, 1), is in front.
     """
 
     labels: Int[Tensor, "n most"]
@@ -78,11 +78,11 @@ def draw_layout(
     """Draw the layout of images whose own classes are ``own``; for ``present`` see ``ObjectCount.draw``.
 
     Raises:
-        ValueError: an image should have more objects than there are classes.
+        ValueError: ``count`` allows more objects in an image than there are classes.
     """
     if count.most > classes:
         raise ValueError(
-            f"synthesis.objects_per_image: want at most the {classes} objects that there are, got {count.most}"
+            f"synthesis.objects_per_image: want at most {classes}, the number of objects, got {count.most}"
         )
     counts = count.draw(len(own), generator, present)
     keys = torch.rand((len(own), classes), generator=generator)

@@ -15,7 +15,7 @@ from neural_sim.types import SceneDraw
 RIGID = ("phi", "rho", "distance")
 """The coordinates that place the camera; the fourth coordinate, the magnification, does not."""
 SHRINK = (-1.0, -1.0, 0.0, 0.0)
-"""The effect of the logarithm of the focal length on the x and y of a pixel's direction."""
+"""Relative change of a pose's columns that has the effect of a relative change of the focal length."""
 
 
 def moved_by(relaxed: Callable[[Float[Tensor, "K"]], SceneDraw], psi: Float[Tensor, "K"]) -> tuple[str, ...]:
@@ -41,15 +41,18 @@ def number_of(draw: SceneDraw, name: str) -> Float[Tensor, "n"]:
 def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"]:
     """Differentiate every image's camera-to-world matrix by each of its draw's ``names``.
 
-    The matrix maps a pixel's direction into the world. A focal length m shrinks that direction's x and y like a matrix
-    with shorter axes: d(x/m)/dm = -(x/m)/m. Only the direction's length differs, and ``ray_rates`` preserves it.
+    The matrix maps a pixel's direction into the world. A focal length m divides that direction's x and y by m, as a
+    matrix with shorter axes would: d(x/m)/dm = -(x/m)/m. This also changes the direction's length, which ``ray_rates``
+    corrects.
 
     Raises:
         ValueError: there is no name, or one that moves no camera.
     """
     drawn = {name: getattr(draw, name) for name in COORDINATES if getattr(draw, name) is not None}
     if not names or set(names) - set(drawn):
-        raise ValueError(f"pose_rates: want names of the draw's among {COORDINATES}, got {tuple(names)}")
+        raise ValueError(
+            f"pose_rates: want names of the draw's coordinates ({', '.join(drawn)}), got {tuple(names)}"
+        )
     numbers = {name: drawn[name].detach() for name in RIGID}
     zeros = {name: torch.zeros_like(number) for name, number in numbers.items()}
 

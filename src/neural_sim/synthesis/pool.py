@@ -1,7 +1,7 @@
 """Renders of every bin of every object, from which training images are composed with new backgrounds and shifts.
 
-Fields do not change while psi is learned. Every bin is rendered once, and its maps are reused in all iterations, which
-saves most of the psi loop's rendering. Pathwise estimators cannot use a pool: they differentiate draws from psi.
+Fields do not change while psi is learned. The pool is rendered once and reused in all iterations, which saves most of
+the rendering in the psi loop. Pathwise estimators cannot use a pool, because they differentiate the renders by psi.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from neural_sim.types import PinholeCamera, SceneDraw
 
 
 def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
-    """Return the number of combinations of bins, and of maps of each so that every bin has at least ``per_bin``."""
+    """Return the number of combinations of bins, and of maps for each such that every bin has at least ``per_bin``."""
     cells = math.prod(factor.bins for factor in factors)
     return cells, math.ceil(per_bin * max((factor.bins for factor in factors), default=1) / cells)
 
 
 @dataclass(frozen=True)
 class PooledSubject:
-    """A subject whose draws are taken from ready renders, with replacement.
+    """A subject whose draws are taken from stored renders, with replacement.
 
     Args:
         name: name of the object.
@@ -102,17 +102,17 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: b
         scene: a scene of subjects that can be rendered.
         per_bin: number of maps of every bin; also of every anchor light, if ``lights``.
         generator: source of everything that the bins leave open.
-        lights: render each map under lights of random weights, Dirichlet with parameter 1/2, instead of refusing lights
-            that move. Draws from this pool then follow psi in their bins but not in their light.
+        lights: if psi weighs lights, render each map under random weights, Dirichlet with parameter 1/2, instead of
+            refusing. Draws from this pool then follow psi in their bins but not in their light.
 
     Raises:
-        ValueError: ``per_bin`` is below 1, a light moves with psi, or a subject has only pictures.
+        ValueError: ``per_bin`` is below 1, psi weighs lights but ``lights`` is not set, or a subject has only pictures.
     """
     if per_bin < 1:
         raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
     distribution = scene.distribution
     if distribution.lights and not lights:
-        raise ValueError("outer.pool_per_bin: a pool has no images under a light that moves, want 0")
+        raise ValueError("outer.pool_per_bin: a pool cannot follow lights that psi weighs, want 0")
     factors = distribution.binned
     cells, per_cell = pool_cells(factors, per_bin)
     per_cell = max(per_cell, math.ceil(per_bin * distribution.lights / cells))
@@ -123,7 +123,7 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: b
     named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
     subjects = []
     for label, subject in enumerate(scene.rendered):
-        # All cells use the same random numbers, so that bins differ only by what the bin changes.
+        # All combinations use the same random numbers, so that bins differ only by what the bin changes.
         noise = distribution.draw_noise(per_cell, generator, subject.dtype)
         noise = noise.select(torch.arange(per_cell).repeat(cells))
         draw = distribution.at_bins(named, noise)

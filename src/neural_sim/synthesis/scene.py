@@ -19,7 +19,7 @@ from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
 CHUNK = 64
 """Number of images of given draws that are rendered and composed together, which bounds the memory. It is not a
-setting, because seeds depend on it."""
+setting, because what a seed draws depends on it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Scene:
 
     @property
     def radii(self) -> tuple[float, ...]:
-        """Radii of rendered objects in the unit of distances: 1 if that is the radius."""
+        """The objects' radii in the unit of distances: 1 if that unit is the radius, or if there are only pictures."""
         metres = self.distribution.distance_unit == "metres"
         return tuple(
             subject.radius if metres and isinstance(subject, RenderedSubject) and subject.radius else 1.0
@@ -75,7 +75,7 @@ class Scene:
 
     @property
     def fields(self) -> tuple[FieldSubject, ...]:
-        """The subjects as fields.
+        """The subjects, all of which are fields.
 
         Raises:
             ValueError: a subject is not a field.
@@ -163,7 +163,7 @@ class Scene:
                 order. None: one object in each image, object by object.
 
         Raises:
-            ValueError: the number of draws is not that of the objects, or is zero.
+            ValueError: the number of draws differs from that of the objects, or is zero.
         """
         if len(draws) != len(self.subjects) or not draws:
             raise ValueError(
@@ -215,5 +215,5 @@ class Scene:
 
 def _able(subject: Subject) -> RenderedSubject:
     if not isinstance(subject, RenderedSubject):
-        raise ValueError(f"{subject.name}: cannot be rendered at given scene parameters")
+        raise ValueError(f"{subject.name}: has only pictures, cannot be rendered at given scene parameters")
     return subject

@@ -1,4 +1,4 @@
-"""Blur and noise of a camera. They are drawn first, so that every pass can be replayed."""
+"""Blur and noise of a camera, drawn before images are made, so that every pass can be replayed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Deviations = Annotated[tuple[NonNegative, NonNegative], Ascending()]
 class SensorDraw:
     """Blur and noise of n images.
 
-    ``blur`` is the standard deviation of a Gaussian in pixels; ``grain`` is added to sRGB values; None means that there
+    ``blur`` is the standard deviation of a Gaussian in pixels; ``grain`` is added to sRGB values. Each is None if there
     is none.
     """
 
@@ -48,7 +48,7 @@ class Sensor:
     def draw(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
     ) -> SensorDraw | None:
-        """Draw them for n images; with neither blur nor noise return None and draw no random number."""
+        """Draw blur and noise for n images; if there is neither, return None and draw no random number."""
         if self.blur[1] == self.noise[1] == 0.0:
             return None
         blur = grain = None
@@ -72,7 +72,7 @@ def seen_by(images: Float[Tensor, "n 3 h w"], sensor: SensorDraw | None) -> Floa
 
 
 def blurred(images: Float[Tensor, "n c h w"], deviation: Float[Tensor, "n"]) -> Float[Tensor, "n c h w"]:
-    """Convolve each image with its own Gaussian, cut at three of the largest standard deviations; edges repeat."""
+    """Convolve each image with its own Gaussian, cut off at three times the largest deviation; edge pixels repeat."""
     n, channels, height, width = images.shape
     reach = max(1, int(torch.ceil(3.0 * deviation.max())))
     offset = torch.arange(-reach, reach + 1, device=images.device, dtype=images.dtype)

@@ -1,4 +1,4 @@
-"""The objects of a scene, which draw and render themselves by their radiance fields or their meshes."""
+"""The objects of a scene, which draw and render themselves from their radiance fields or meshes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ CPU = torch.device("cpu")
 
 
 class Subject(Protocol):
-    """One object of a scene, which draws itself from p_psi alone; the scene composes it with others and a background.
+    """One object of a scene. It draws itself alone, from p_psi; the scene composes it with others and a background.
 
     All kinds have exact draws. Only a ``FieldSubject`` has draws with derivatives by psi (``RelaxedDraws``); other
-    kinds refuse them with a ``ValueError`` that names the object.
+    kinds refuse them with a ``ValueError``.
     """
 
     @property
@@ -104,7 +104,7 @@ class RenderedSubject(ABC):
         camera_to_world: Float[Tensor, "n 4 4"],
         weights: Float[Tensor, "n lights"] | None = None,
     ) -> Maps:
-        """Render views of the object over nothing.
+        """Render views of the object without a background.
 
         Args:
             camera: camera of all views.
@@ -184,7 +184,7 @@ class FieldSubject(RenderedSubject):
         name: name of the object.
         radius: see ``RenderedSubject``.
         field: the field, which may have appearance codes.
-        renderer: its renderer; it must weigh lights if the field has appearance codes.
+        renderer: its renderer; it must support weights of lights if the field has appearance codes.
     """
 
     field: RadianceField
@@ -277,7 +277,7 @@ class FieldSubject(RenderedSubject):
     def _maps_with_tangents(
         self, camera: PinholeCamera, draw: SceneDraw, names: tuple[str, ...]
     ) -> tuple[Maps, dict[str, Maps]]:
-        """Render the maps, and their derivatives by the named numbers of the draw and by every weight of a light."""
+        """Render the maps, and their derivatives by the named numbers of the draw and by the weight of every light."""
         poses = orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius).to(self.device, self.dtype)
         rates = pose_rates(draw, names).to(poses) if names else poses.new_zeros(0, *poses.shape)
         lights = 0 if draw.weights is None else draw.weights.shape[1]
@@ -300,7 +300,7 @@ class FieldSubject(RenderedSubject):
 
 @dataclass(frozen=True)
 class PhotographedField(RenderedSubject):
-    """A field with straight alpha in [0, 1], in float32 on the CPU, under the light of its photographs.
+    """A field under the light of its photographs, with colours and opacity in [0, 1], in float32 on the CPU.
 
     Args:
         name: name of the object.
@@ -338,8 +338,8 @@ class MeshSubject(RenderedSubject):
         name: name of the object.
         radius: see ``RenderedSubject``.
         mesh: the mesh in its normalised frame.
-        renderer: its renderer, with the light of images whose lights have no weights.
-        rig: lights that draws may weigh; None if the light is fixed.
+        renderer: its renderer, whose own light applies to draws without weights of lights.
+        rig: lights to which draws may give weights; None if the light is fixed.
     """
 
     mesh: trimesh.Trimesh
@@ -357,15 +357,15 @@ class MeshSubject(RenderedSubject):
         lighting = None
         if weights is not None:
             if self.rig is None:
-                raise ValueError(f"{self.name}: want one fixed light for its mesh, got weights of lights")
+                raise ValueError(f"{self.name}: its mesh has one fixed light, got weights of lights")
             if bool((weights != weights[0]).any()):
-                raise ValueError(f"{self.name}: want one light for all images of its mesh")
+                raise ValueError(f"{self.name}: want the same weights of lights for all images of its mesh")
             lighting = self.rig.lighting(weights[0])
         return _maps_of(premultiplied(self.renderer.render(self.mesh, camera, camera_to_world, lighting)))
 
 
 def not_differentiable(name: str, how: Draws) -> ValueError:
-    """Return the error that refuses draws with derivatives by a subject that has none."""
+    """Return the error of a subject that has no draws with derivatives."""
     return ValueError(f"{name}: want hard draws, because only fields are differentiated by psi, got {how}")
 
 

@@ -66,10 +66,10 @@ class Synthesizer:
         minimum_area: smallest number of visible pixels for which an object gets a box.
         objects_per_image: smallest and largest number of objects in an image, all of different classes; [0, 6] includes
             images without objects.
-        min_visibility: smallest fraction of an object's pixels within the image that other objects must leave visible
-            for it to get a box.
+        min_visibility: smallest fraction of an object's pixels within the image that must not be hidden for it to get a
+            box.
         sensor: blur and noise of the camera.
-        distractors: unlabelled things, behind and in front of the objects.
+        distractors: unlabelled cut-outs, behind and in front of the objects.
 
     Raises:
         ValueError: the background has no method ``draw``.
@@ -115,7 +115,7 @@ class Synthesizer:
             camera: their camera.
             generator: source of randomness.
             device: device of backgrounds and covers.
-            objects: number of shifts in each image; None for one shift without that axis.
+            objects: number of shifts in each image; None: one, without an axis for objects.
         """
         height, width = camera.height, camera.width
         backgrounds = self.background.draw(n, height, width, generator, device)
@@ -137,7 +137,7 @@ class Synthesizer:
         """Compose one object's images with their boxes, on the device and in the dtype of ``rgb``.
 
         A pure function; the images are differentiable in ``rgb`` (premultiplied) and ``opacity``, the boxes are not. If
-        the object is out of frame or below ``minimum_area``, the image has no box.
+        too little of the object is in the frame and visible, the image has no box.
         """
         rgb, opacity = apply_shift(rgb, nuisance.shifts), apply_shift(opacity, nuisance.shifts)
         images = composite(rgb, opacity, nuisance.backgrounds.to(rgb))
@@ -150,7 +150,7 @@ class Synthesizer:
         images = seen_by(images, nuisance.sensor)
         labels = torch.where(present, label, -1)[:, None]
         labelled = LabelledImages(images, boxes, labels, bins.to(rgb.device))
-        if _log.isEnabledFor(logging.DEBUG):  # counting makes the host wait for the device
+        if _log.isEnabledFor(logging.DEBUG):  # counting waits for the device
             missing = images_without_boxes(labelled)
             _log.debug("class %d: %d of %d images without a box", label, missing, len(labelled))
         return labelled
@@ -190,7 +190,7 @@ class Synthesizer:
 
 
 def _clear(front: Cover, like: Tensor) -> Float[Tensor, "n 1 h w"]:
-    """Return the fraction of what is behind that stays visible."""
+    """Return the fraction of what lies behind a cover that stays visible, by pixel."""
     return (1.0 - front.opacity.to(like))[:, None]
 
 

@@ -18,7 +18,7 @@ def bin_thumbnails(
 ) -> Float[Tensor, "bins h w 3"]:
     """Render an object over white from the middle of every bin of one factor.
 
-    Coordinates of other factors are at the middle of their range, or of their middle bin; lights have equal weights.
+    All other coordinates are in the middle of their range, or of their middle bin; lights have equal weights.
     """
     learned = {f.coordinate for f in distribution.binned}
     count = next(f.bins for f in distribution.binned if f.name == factor)

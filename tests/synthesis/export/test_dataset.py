@@ -128,7 +128,7 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_is(boxes, whole, t
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(
-        ValueError, match=r"export\.folder: .*mine has files and no manifest\.json; want a new folder"
+        ValueError, match=r"export\.folder: .*mine has files but no manifest\.json; want a new folder"
     ):
         written(data_of(boxes, tmp_path / "mine"))
     assert contents(tmp_path / "mine") == {"notes.txt": b"mine"}
@@ -137,7 +137,7 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_is(boxes, whole, t
     with pytest.raises(ValueError, match=r"export\.folder: .*manifest\.json cannot be written"):
         written(data_of(boxes, tmp_path / "mine" / "notes.txt" / "below"))
     (tmp_path / "mine" / "manifest.json").write_text("{")
-    with pytest.raises(ValueError, match=r"manifest\.json is no manifest of an export"):
+    with pytest.raises(ValueError, match=r"manifest\.json is not the manifest of an export"):
         written(data_of(boxes, tmp_path / "mine"))
 
 
@@ -179,7 +179,7 @@ def test_images_for_validation_are_spread_and_stay_so_when_a_set_grows(boxes, tm
 
 def test_too_few_images_are_not_parted_and_that_is_said(boxes, tmp_path, caplog):
     written(data_of(boxes, tmp_path / "data", count=2, val_fraction=0.1))
-    assert "2 images are too few to part them" in caplog.text
+    assert "2 images are too few for a split" in caplog.text
     assert "no split is made" in (tmp_path / "data" / "dataset.yaml").read_text()
 
 

@@ -2,7 +2,7 @@
 
 It has ``train/<scene>/{rgb,depth,mask,mask_visib}`` with ``scene_gt.json``, ``scene_gt_info.json`` and
 ``scene_camera.json``; and ``models/models_info.json`` with the meshes, if there are any. All objects are listed,
-whether labelled or hidden.
+even those of which too little is visible for a label.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Model:
     """An object as BOP describes it.
 
     ``millimetres`` is the radius of its bounding sphere; ``to_model`` maps the object's normalised frame to its
-    model's, in millimetres; ``mesh`` is in that frame, or None if there is none.
+    model's, in millimetres; ``mesh`` is in the latter frame, or None if there is none.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Model:
 
     def pose(self, camera_to_world: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
         """Return the rigid model-to-camera matrix, from the camera's pose in the object's normalised frame."""
-        # Both frames measure the same object: the scales cancel.
+        # The scales to and from millimetres cancel, so the product is rigid.
         to_camera = (
             np.diag([self.millimetres] * 3 + [1.0]) @ OPENCV @ np.linalg.inv(np.asarray(camera_to_world))
         )
@@ -73,7 +73,7 @@ class Model:
 
 
 def object_ids(class_names: Sequence[str]) -> list[int]:
-    """Return BOP's ids: the numbers in names such as ``obj_000003`` if all classes have such names, else 1, 2, ..."""
+    """Return BOP's ids: the numbers in names such as ``obj_000003`` if all are such names, otherwise 1, 2, ..."""
     found = [re.fullmatch(r"obj_(\d+)", name) for name in class_names]
     numbers = [int(match[1]) for match in found if match]
     return numbers if len(set(numbers)) == len(found) else list(range(1, len(found) + 1))
@@ -157,7 +157,7 @@ def _info(item: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _toolkit_box(box: Sequence[int]) -> list[int]:
-    """Return a box as the toolkit counts: width and height are differences between the last and the first pixel."""
+    """Return a box as BOP's toolkit writes it: width and height are the last pixel's index minus the first one's."""
     return [box[0], box[1], box[2] - 1, box[3] - 1]
 
 

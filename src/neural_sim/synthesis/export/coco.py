@@ -1,4 +1,4 @@
-"""Drawn sets as COCO: a training set in memory as PNG images and one JSON, and an exported set from its records."""
+"""COCO files of drawn images: of a training set in memory, with its pictures, or of an exported set's records."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ def write_coco(
 ) -> Path:
     """Write ``folder/images/*.png`` (8 bit) and ``folder/annotations.json``; return the latter's path.
 
-    ``poses`` has, for each image, those of its objects, labelled or hidden: their ``category_id``, phi, rho (radians),
-    distance (object radii), camera_to_world [4, 4] (OpenGL axes) and whatever else made the image. They become each
-    image's ``poses``, next to its ``bin``. The JSON is written last and at once: if it exists, all its images do.
+    ``poses`` lists the poses of each image's objects, labelled or not: their ``category_id``, phi, rho (radians),
+    distance (object radii), camera_to_world [4, 4] (OpenGL axes) and whatever else made the image. They are stored as
+    the image's ``poses``, next to its ``bin``. The JSON is written last, whole or not at all: if it exists, so do all
+    its images.
 
     Raises:
-        ValueError: a label has no name, or ``poses`` has another length than the images.
+        ValueError: a label has no name, or the numbers of ``poses`` and images differ.
     """
     folder = Path(folder)
     _check(images, class_names, poses)

@@ -50,7 +50,7 @@ class ImageWriter:
             for path, content in files.items():
                 write_whole(self.root / path, content)
         file, stream = f"images/{number:06d}.{self.image_format}", io.BytesIO()
-        # Only without chroma subsampling do fine edges keep their colour.
+        # Fine edges keep their colour only without chroma subsampling.
         options = {"quality": 95, "subsampling": 0} if self.image_format == "jpg" else {"compress_level": 1}
         Image.fromarray(image.pixels).save(stream, "JPEG" if self.image_format == "jpg" else "PNG", **options)
         write_whole(self.root / file, stream.getvalue())
@@ -62,9 +62,10 @@ class ImageWriter:
 class DataSet:
     """``count`` images from ``source`` in ``root``, in ``formats``.
 
-    Existing images stay, with their ids; those numbered ``count`` or more stay in the set, too. ``identity`` is what
-    all images depend on, see ``ExportFolder``; ``models`` are the objects as BOP describes them.
-    ``val_fraction`` of the images are for validation; an image stays in its part when the set grows.
+    Existing images stay in the set, with their ids, even those numbered ``count`` or more. ``identity`` is what all
+    images depend on, see ``ExportFolder``; ``models`` are the objects as BOP describes them, with depths of up to
+    ``farthest`` millimetres. ``val_fraction`` of the images are for validation; an image stays in its part when the set
+    grows. For ``workers`` see ``each``.
     """
 
     source: ImageSource
@@ -110,7 +111,7 @@ class DataSet:
         return ordered
 
     def parts(self, records: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-        """Return the records for training and for validation; nothing where one of them would be empty."""
+        """Return the records for training and for validation, or nothing if either would be empty."""
         parts: dict[str, list[Mapping[str, Any]]] = {"train": [], "val": []}
         for record in records:
             held_out = spread(record["number"], self.val_fraction, GOLDEN)
@@ -120,8 +121,8 @@ class DataSet:
     def _annotate(self, records: Sequence[Mapping[str, Any]], scale: float) -> None:
         names, parts = self.source.scene.names, self.parts(records)
         if self.val_fraction and not parts:
-            _log.warning("export: %d images are too few to part them: no split is made", len(records))
-        for name in ("train", "val"):  # of an earlier export with another split
+            _log.warning("export: %d images are too few for a split: none is made", len(records))
+        for name in ("train", "val"):  # an earlier export may have made another split
             (self.root / f"annotations_{name}.json").unlink(missing_ok=True)
         if "coco" in self.formats:
             varies = any(
@@ -146,8 +147,8 @@ def each(
     """Yield the results of ``task`` for each number, in order.
 
     Every worker computes with one torch thread, so that results do not depend on the number of workers. ``by`` is the
-    number of processes (0: this process alone) or a cluster. Each worker gets the task once, so that it must be
-    picklable; it writes to ``folder``.
+    number of processes (0: this process alone) or a cluster. Each worker receives the task once, pickled; all must see
+    ``folder``, to which it writes.
 
     Raises:
         WorkersLost: a worker ended without a result, and its replacements did, too.
@@ -160,9 +161,7 @@ def each(
             for made in [submit(number) for number in numbers]:
                 yield made.result()
     except WorkersLost as lost:
-        raise WorkersLost(
-            f"export: {lost}; the same command goes on after the images that are there"
-        ) from lost
+        raise WorkersLost(f"export: {lost}; the same command continues after the images that exist") from lost
 
 
 def _here(task: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None, None]:

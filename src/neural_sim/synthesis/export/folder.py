@@ -21,12 +21,12 @@ from neural_sim.types import PinholeCamera
 MANIFEST = "manifest.json"
 RECORDS = "records.jsonl"
 LONGEST = 60
-"""Longest value, in characters, that a message quotes."""
+"""Number of characters after which messages cut a value."""
 
 
 @dataclass(frozen=True)
 class ExportFolder:
-    """Images of one ``identity`` (all that they depend on except their number), which can be continued and extended."""
+    """Images of one ``identity`` (all that they depend on except their number), to which more can be added."""
 
     root: Path
     identity: Mapping[str, Any]
@@ -47,7 +47,7 @@ class ExportFolder:
         yield read_records(self.root)
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Add the record of an image whose files are written."""
+        """Add the record of an image whose files have been written."""
         path = self.root / RECORDS
         try:
             with path.open("a", encoding="utf-8") as stream:
@@ -58,7 +58,7 @@ class ExportFolder:
     def finish(self, records: Sequence[Mapping[str, Any]]) -> None:
         """Write the manifest: every image's file and hash, and its objects' parameters and poses.
 
-        The records are sorted: images that were made again are not in order.
+        ``records`` are in order and replace those in the folder, where images that were made again come last.
         """
         write_whole(self.root / RECORDS, "".join(line_of(record) for record in records))
         images = [
@@ -81,14 +81,14 @@ class ExportFolder:
         if not path.is_file():
             if self.root.is_dir() and any(self.root.iterdir()):
                 raise ValueError(
-                    f"export.folder: {self.root} has files and no {MANIFEST}; want a new folder, or that of an export"
+                    f"export.folder: {self.root} has files but no {MANIFEST}; want a new folder, or that of an export"
                 )
             return
         try:
             known = parsed_json(path.read_text(encoding="utf-8"))["identity"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"export.folder: {path} is no manifest of an export ({error!r}); want another folder"
+                f"export.folder: {path} is not the manifest of an export ({error!r}); want another folder"
             ) from error
         different = first_difference(known, json.loads(json.dumps(self.identity)))
         if different is not None:
@@ -121,8 +121,8 @@ def record_of(
 ) -> dict[str, Any]:
     """Return an image's record, from which annotation files of any format are assembled.
 
-    Boxes are (x, y, width, height) in pixels along pixel edges; null if there is none. ``camera`` is in OpenCV's
-    convention: (0, 0) is the centre of the upper left pixel. ``digest`` is the SHA-256 of the file's bytes.
+    Boxes are (x, y, width, height) in pixels along pixel edges; null if there is none. The record's camera follows
+    OpenCV: (0, 0) is the centre of the upper left pixel. ``digest`` is the SHA-256 of the file's bytes.
     """
     shown = image.objects[0].placed.camera if image.objects else camera
     return {
@@ -176,7 +176,7 @@ def _sized(box: tuple[int, int, int, int] | None) -> list[int] | None:
 def read_records(folder: Path) -> dict[int, dict[str, Any]]:
     """Read the records of a folder, by number, for images whose files exist.
 
-    A line that an ended process left unfinished is not a record; the file is rewritten without such lines.
+    A line that a killed process left unfinished is not a record; the file is rewritten without such lines.
 
     Raises:
         ValueError: a file cannot be read.
@@ -200,7 +200,7 @@ def read_records(folder: Path) -> dict[int, dict[str, Any]]:
 
 
 def line_of(record: Mapping[str, Any]) -> str:
-    """Return a record's line of the file."""
+    """Return a record as a line of the file."""
     return json.dumps(record, allow_nan=False) + "\n"
 
 
@@ -215,7 +215,7 @@ def _parsed(lines: list[str]) -> Iterator[dict[str, Any]]:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file at once, creating its folder.
+    """Write a file, whole or not at all, and create its folder.
 
     Raises:
         ValueError: the system refuses to write it; the message has the file and the reason.
@@ -252,6 +252,6 @@ def same_file(source: Path, path: Path) -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove the files that an ended process left unfinished."""
+    """Remove the files that a killed process left unfinished."""
     for path in folder.rglob(f".*{PART}"):
         path.unlink(missing_ok=True)

@@ -20,7 +20,7 @@ from neural_sim.synthesis.sensor import seen_by
 from neural_sim.types import PinholeCamera, SceneDraw
 
 MASK_OPACITY = 0.5
-"""Opacity above which a pixel belongs to an object: at it a ray has lost half of its light, where the depth is."""
+"""Opacity above which a pixel belongs to an object. Depths are measured where a ray has lost this much of its light."""
 GOLDEN, SILVER = 0.5 * (math.sqrt(5.0) - 1.0), math.sqrt(2.0) - 1.0
 """Steps that spread numbers evenly, however many there are, and independently of each other."""
 
@@ -33,8 +33,8 @@ class DrawnObject:
 
     ``draw`` are its scene parameters (one draw; distance in object radii); ``shift`` are the pixels (right, down) from
     the principal point to its centre; ``camera`` is the image's camera with the draw's magnification;
-    ``camera_to_world`` is the camera's pose in the object's frame (float64, OpenGL axes, object radii). Of two objects
-    at equal distances, the one with the smaller ``order``, in [0, 1), is in front.
+    ``camera_to_world`` is the camera's pose in the object's frame (float64, OpenGL axes, object radii). If two objects
+    are equally distant, the one with the smaller ``order``, in [0, 1), is in front.
     """
 
     label: int
@@ -49,9 +49,9 @@ class DrawnObject:
 class ShownObject:
     """An object in an image.
 
-    ``full`` are the pixels of its silhouette within the image, ``visible`` those that no other object hides; ``pixels``
-    counts those of its whole silhouette, also beyond the image, and ``box`` (x0, y0, x1, y1) surrounds them, None if
-    there are none. ``labelled``: enough of it is visible for a label.
+    ``full`` are the pixels of its silhouette within the image, ``visible`` those that nothing hides; ``pixels`` counts
+    those of its whole silhouette, also beyond the image, and ``box`` (x0, y0, x1, y1) surrounds them, None if there are
+    none. ``labelled`` says whether enough of it is visible for a label.
     """
 
     placed: DrawnObject
@@ -64,7 +64,7 @@ class ShownObject:
 
 @dataclass(frozen=True, eq=False)
 class ExportImage:
-    """An image, sRGB in 8 bits, with its depth and objects, the layout's first one first.
+    """An image, sRGB in 8 bits, with its depth and its objects, in the order of the layout.
 
     The depth is that of the visible surface along the view axis, in millimetres, and 0 where there is no object.
     """
@@ -75,7 +75,7 @@ class ExportImage:
 
 
 def spread(number: int, fraction: float, step: float) -> bool:
-    """Return whether a number is one of a fraction of all, which are evenly spread over any run of numbers."""
+    """Return whether a number belongs to a fraction of all numbers that is spread evenly over any range."""
     return (number + 1) * step % 1.0 < fraction
 
 
@@ -84,9 +84,9 @@ class ImageSource:
     """Images by number. An image depends only on ``seed`` and its number, so that a set can grow.
 
     ``scene`` says how images are made; they are drawn from ``psi`` [objects, K]; ``camera`` has their size.
-    ``millimetres`` is each object's radius. Image i has the class i modulo their number as its own. The synthesizer's
-    shift turns the camera (``cameras.turned``), so that every object has an exact pose under the image's one camera.
-    A fraction ``empty`` of the images shows no object.
+    ``millimetres`` is each object's radius. The own class of image i is i modulo the number of classes. The
+    synthesizer's shift turns the camera (``cameras.turned``), so that every object has an exact pose under the image's
+    one camera. A fraction ``empty`` of the images shows no object.
     """
 
     scene: Scene
@@ -160,7 +160,7 @@ class ImageSource:
         return ExportImage(pixels, depth.cpu().numpy(), shown_objects)
 
     def _layer(self, item: DrawnObject) -> Layer:
-        """Render one object alone, on the part of the plane that it may reach."""
+        """Render one object alone, on the part of the image plane that it may cover."""
         subject = self.scene.fields[item.label]
         left, top, right, bottom = reach_on_image(item.camera, item.camera_to_world, subject.field.reach)
         camera = cropped(item.camera, left, top, max(right - left, 1), max(bottom - top, 1))
@@ -197,7 +197,7 @@ class Layer:
     depth: Float[Tensor, "h w"]
 
     def within(self, height: int, width: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Cut the rectangle to an image; return its rows and columns in the layer, and in the image."""
+        """Intersect the rectangle with an image; return the rows and columns in the layer, and in the image."""
         high, wide = self.opacity.shape
         rows = max(0, self.top), max(0, self.top, min(height, self.top + high))
         columns = max(0, self.left), max(0, self.left, min(width, self.left + wide))
@@ -212,8 +212,8 @@ class Layer:
 def reach_on_image(camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], radius: float) -> Box:
     """Return whole pixels (x0, y0, x1, y1) around the image of the ball of ``radius`` about the origin.
 
-    They lie within three image sizes around the image, the canvas on which the BOP toolkit counts pixels beyond the
-    image; they are empty if the ball has no image.
+    They are cut to a canvas of three times the image's width and height around it, on which the BOP toolkit counts
+    pixels beyond the image, and are empty if the ball has no image.
     """
     x, y, z = (camera_to_world[:3, :3].t() @ -camera_to_world[:3, 3]).tolist()
     sides = []

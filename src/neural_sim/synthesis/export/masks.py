@@ -33,9 +33,9 @@ def box_of(mask: Bool[np.ndarray, "height width"]) -> Box | None:
 
 
 def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "_ 2"]]:
-    """Trace a mask's closed outlines, each as its corners (x, y) along pixel edges, those around most pixels first.
+    """Trace a mask's closed outlines, each as its corners (x, y) along pixel edges, the largest first.
 
-    Outlines of parts go clockwise in the image, those of holes counter-clockwise; parts that touch at a corner are two.
+    Outlines of parts go clockwise in the image, those of holes counter-clockwise; touching corners do not join parts.
     """
     whole = np.pad(mask, 1).astype(np.int8)
     starts: dict[tuple[int, int], list[int]] = {}

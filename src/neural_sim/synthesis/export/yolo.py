@@ -30,10 +30,10 @@ def write_yolo(
     YOLO expects.
 
     Args:
-        folder: of the data set.
-        records: of all images.
-        class_names: by label.
-        parts: those of ``train`` and ``val``; without any, both are all images, and the file says so.
+        folder: the data set's folder.
+        records: records of all images.
+        class_names: names of the classes, by label.
+        parts: records of ``train`` and ``val``; if empty, both are all images, and the file says so.
     """
     for record in records:
         name = Path(record["file"])
@@ -44,7 +44,7 @@ def write_yolo(
                 write_whole(path, "".join(f"{text}\n" for text in lines))
         same_file(folder / name, folder / SEGMENT / "images" / name.name)
     names = "".join(f"  {label}: {json.dumps(name)}\n" for label, name in enumerate(class_names))
-    # Without a root in the file, readers take paths to be relative to the file.
+    # The file names no root, so readers take its paths as relative to itself.
     heads = [f"{part}: {part}.txt\n" for part in parts] or [
         "train: images\nval: images # no split is made; name your own\n"
     ]
