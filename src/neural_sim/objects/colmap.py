@@ -29,7 +29,7 @@ MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", ".")
 """Where models are looked for, in this order. COLMAP numbers several models (``sparse/0``, ``sparse/1``); the one with
 the most photographs is used."""
 PLACES = ("images", "input")
-"""Folders of photographs; 3D Gaussian splatting tools use ``input``. Without either, it is the capture's own."""
+"""Folders of photographs (``input`` in 3D Gaussian splatting tools); without either, the capture's own folder."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Names of each camera model's parameters, in COLMAP's order.
 PARAMETERS: dict[str, str] = {

@@ -109,7 +109,7 @@ _REFERENCES: dict[str, Callable[[Path], list[Path]]] = {
 def choose(
     available: dict[str, Path], names: Sequence[Any] | None, aliases: dict[str, str], where: str
 ) -> list[str]:
-    """Return the objects that ``names`` lists, in that order, with aliases resolved; for None, all, sorted.
+    """Return the objects that ``names`` lists, in that order, with aliases resolved; None lists all, sorted.
 
     A value that the command line parsed as a number or YAML keyword (1, 1e3, 2024_05_01, true, null) stands for the
     only name that can be read as this value.

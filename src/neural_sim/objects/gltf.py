@@ -27,7 +27,7 @@ _READ = (
     "KHR_texture_transform", "KHR_mesh_quantization", "KHR_lights_punctual", "KHR_animation_pointer",
     "EXT_texture_webp", "EXT_texture_avif",
 )  # fmt: skip
-"""Extensions that are accepted, in addition to all KHR_materials_, of which only base colours are used."""
+"""Extensions that are accepted, in addition to all KHR_materials_*, of which only base colours are used."""
 _DRACO, _GLOSSINESS = "KHR_draco_mesh_compression", "KHR_materials_pbrSpecularGlossiness"
 
 

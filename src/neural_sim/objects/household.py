@@ -2,7 +2,7 @@
 
 The pitcher's +x side is the can's label, except for the position of its bar; its -x side has the handle and another
 print. The drill's -x side is the tall box's front, except for the colours of two marks; its +x side has grip and chuck,
-which the housing hides from cameras within 43 degrees of -x and 4 object radii. Lengths are in units of the body's
+which the housing hides from cameras up to 43 degrees off -x and 4 object radii away. Lengths are in units of the body's
 radius or half height; the loader normalises them.
 """
 
@@ -74,7 +74,7 @@ def pitcher(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def tall_box(generator: torch.Generator) -> trimesh.Trimesh:
-    """Make a red carton: front print on +x, the shared back print on -x."""
+    """Make a red carton: front print on +x, and on -x the back print, which the flat box has, too."""
     panels = _box_prints(generator)
     panels["+x"] = _red_front(BOX_EMBLEM, BOX_BAND, generator)
     panels["-x"] = _red_back(generator)

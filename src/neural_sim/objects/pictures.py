@@ -38,7 +38,7 @@ BOX_FILE = "box.json"
 """File with the object's box in the capture's folder, saved by the page of ``stages=[box]``."""
 FOLDER = "masks"
 SHARPNESS = 4.0
-"""Factor that steepens the opacity of computed masks around one half: objects become opaque, and fog vanishes."""
+"""Factor that steepens the opacity of scene masks around one half: objects become opaque, and fog vanishes."""
 
 
 @runtime_checkable
@@ -197,7 +197,11 @@ def mask_beside(image: Path, source: Path) -> Path | None:
     levels = len(Path(whole).parts) - len(Path(home).parts) + 1
     for folder in [image.parent, *image.parent.parents][: max(2, levels)]:
         below = image.parent.relative_to(folder)
-        inner = [below, Path(*below.parts[1:]), Path()]  # without the folder of images, and by name alone
+        inner = [
+            below,
+            Path(*below.parts[1:]),
+            Path(),
+        ]  # also without the images' own folder, and by the file's name alone
         for part in dict.fromkeys(inner):
             for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
                 if (folder / FOLDER / part / name).is_file():

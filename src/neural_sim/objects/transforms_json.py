@@ -104,7 +104,7 @@ def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> dict[str, Any]:
-    """Apply nerfstudio's lists: ``val`` and ``test`` list test frames; with a list ``train``, others are left out."""
+    """Apply nerfstudio's lists: ``val`` and ``test`` are test frames; with a ``train``, unlisted ones are left out."""
     lists = {part: document[f"{part}_filenames"] for part in PARTS if f"{part}_filenames" in document}
     if not lists:
         return document

@@ -122,7 +122,7 @@ class Shared:
         nuisance: Nuisance,
         synthesizer: Synthesizer,
     ) -> Shared:
-        """Return the images of ``objects``, with each class's renders in the order in which ``layout`` shows it."""
+        """Combine ``objects`` into images; each class's renders are in the order in which ``layout`` shows it."""
         place = torch.full_like(layout.labels, -1)
         own = torch.full((len(layout),), -1)
         for label, part in enumerate(objects):
@@ -178,7 +178,7 @@ class Shared:
         return lambda rgb, opacity: self.images(rows, columns, Maps(rgb, opacity))
 
     def repeated(self, index: Int[Tensor, "m"], label: int, part: RenderedObject) -> Shared:
-        """Return the images ``index``, each with the next render of ``part``, of class ``label``, as its own object."""
+        """Return the images ``index`` with renders of ``part`` (class ``label``), in order, as their own objects."""
         place = self.place[index].clone()
         place[:, 0] = torch.arange(len(index))
         objects = [part if i == label else other for i, other in enumerate(self.objects)]

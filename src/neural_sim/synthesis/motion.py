@@ -27,7 +27,7 @@ def moved_by(relaxed: Callable[[Float[Tensor, "K"]], SceneDraw], psi: Float[Tens
 
 
 def light_names(count: int) -> tuple[str, ...]:
-    """Name the derivatives by each weight of a draw's light."""
+    """Name the weights of a draw's lights, by which derivatives are taken."""
     return tuple(f"weights_{i}" for i in range(count))
 
 
@@ -46,7 +46,7 @@ def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"
     corrects.
 
     Raises:
-        ValueError: there is no name, or one that moves no camera.
+        ValueError: ``names`` is empty, or has one that is not a coordinate of the draw.
     """
     drawn = {name: getattr(draw, name) for name in COORDINATES if getattr(draw, name) is not None}
     if not names or set(names) - set(drawn):

@@ -52,7 +52,7 @@ class Scene:
 
     @property
     def radii(self) -> tuple[float, ...]:
-        """The objects' radii in the unit of distances: 1 if that unit is the radius, or if there are only pictures."""
+        """The objects' radii in the unit of distances; 1 if that is the radius, or if an object has only pictures."""
         metres = self.distribution.distance_unit == "metres"
         return tuple(
             subject.radius if metres and isinstance(subject, RenderedSubject) and subject.radius else 1.0
@@ -215,5 +215,7 @@ class Scene:
 
 def _able(subject: Subject) -> RenderedSubject:
     if not isinstance(subject, RenderedSubject):
-        raise ValueError(f"{subject.name}: has only pictures, cannot be rendered at given scene parameters")
+        raise ValueError(
+            f"{subject.name}: has only stored pictures, cannot be rendered at given scene parameters"
+        )
     return subject

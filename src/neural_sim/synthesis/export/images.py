@@ -84,9 +84,9 @@ class ImageSource:
     """Images by number. An image depends only on ``seed`` and its number, so that a set can grow.
 
     ``scene`` says how images are made; they are drawn from ``psi`` [objects, K]; ``camera`` has their size.
-    ``millimetres`` is each object's radius. The own class of image i is i modulo the number of classes. The
-    synthesizer's shift turns the camera (``cameras.turned``), so that every object has an exact pose under the image's
-    one camera. A fraction ``empty`` of the images shows no object.
+    ``millimetres`` is each object's radius. Image i's own class is i modulo the number of classes. The synthesizer's
+    shift turns the camera (``cameras.turned``), so that every object has an exact pose under the image's one camera. A
+    fraction ``empty`` of the images shows no object.
     """
 
     scene: Scene
@@ -212,8 +212,8 @@ class Layer:
 def reach_on_image(camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], radius: float) -> Box:
     """Return whole pixels (x0, y0, x1, y1) around the image of the ball of ``radius`` about the origin.
 
-    They are cut to a canvas of three times the image's width and height around it, on which the BOP toolkit counts
-    pixels beyond the image, and are empty if the ball has no image.
+    They are clipped to the canvas, three times as wide and high as the image, on which the BOP toolkit counts pixels
+    beyond it, and are empty if the ball has no image.
     """
     x, y, z = (camera_to_world[:3, :3].t() @ -camera_to_world[:3, 3]).tolist()
     sides = []
