@@ -111,7 +111,7 @@ def test_a_loop_that_was_killed_ends_at_the_same_bits(scene, interrupted, kind, 
         learned = learn_psi(make(), seen.append, checkpoint())
     assert _bits(learned) == whole
     assert seen == learned.records  # what watches the run sees all iterations
-    assert f"resumes after round {done}" in caplog.text
+    assert f"resuming an interrupted run after round {done}" in caplog.text
 
 
 def test_a_method_of_rewards_that_was_killed_ends_at_the_same_bits(reward_loop, interrupted):

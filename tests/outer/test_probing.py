@@ -85,7 +85,7 @@ def test_every_place_is_renewed_in_turn(per_bin, part):
 
 
 def test_more_fresh_probes_than_places_are_refused():
-    with pytest.raises(ValueError, match="3 fresh ones a bin for 2 places"):
+    with pytest.raises(ValueError, match="at most 2 fresh ones per bin, got 3"):
         _probes(2, 0).renewed(_probes(3, 0), 0)
 
 

@@ -44,19 +44,19 @@ def test_a_step_is_told_in_words():
     second = record(0.5330, verdicts=verdicts(pitcher=True, drill=True, mug=False), certificate=steps)
     assert iteration_line([first, second], 10, 24.4, 190.0) == (
         "psi 2/10: validation loss 0.533 (0.616 at the start); accepted pitcher, drill; rejected mug; tries can, mug; "
-        "wait for these: drill; no signal: 1; 24 s, about 3 min left"
+        "waiting: drill; no signal: 1; 24 s, about 3 min left"
     )
 
 
 def test_the_last_one_says_what_goes_back_and_no_time_that_is_left():
     last = record(0.5, taken_back={"mug": TakenBack(kept=1, accepted=3, gain=0.1)})
     told = iteration_line([record(0.6), last], 2, 100.0, None)
-    assert told.endswith("mug goes back to its best psi (1 of 3 steps stay); 2 min")
+    assert told.endswith("mug goes back to its best psi (1 of 3 accepted steps kept); 2 min")
 
 
 def test_a_loop_that_ends_early_says_why():
     told = iteration_line([record(0.6), record(0.5)], 9, 24.0, None)
-    assert told.endswith("; 24 s; the loop ends here, for no step is left to try")
+    assert told.endswith("; 24 s; the loop ends here, because no step is left to try")
 
 
 def test_a_round_without_a_derivative_and_a_derivative_that_is_not_trusted():

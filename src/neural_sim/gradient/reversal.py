@@ -170,7 +170,7 @@ def reversed_steps(
             eps^(2/3). ``reverse_over_reverse``: exact, in the time of three and a half gradients and with the memory of
             a second derivative.
         wanted: which sums the estimator reads.
-        floor: the fraction passed to ``detector.optimiser.AdamW.floored``; at 0 the derivative is exact.
+        floor: the fraction passed to ``detector.trajectory.AdamW.floored``; at 0 the derivative is exact.
 
     Raises:
         ValueError: an unknown product, or a slope that does not have theta's length.

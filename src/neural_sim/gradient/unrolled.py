@@ -139,7 +139,7 @@ class Unrolled:
             number of objects.
         chunk_size: number of probes whose losses are computed at a time.
         floor: smallest denominator allowed for an entry of theta in AdamW's steps, as a fraction of what is usual for
-            the entry and its tensor, see ``detector.optimiser.AdamW.floored``; 0 is exact.
+            the entry and its tensor, see ``detector.trajectory.AdamW.floored``; 0 is exact.
     """
 
     product: Product = "forward_difference"

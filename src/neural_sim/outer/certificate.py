@@ -1,7 +1,7 @@
-"""Quality of each iteration's hypergradient, the conditions that it fails, and what happens to the steps.
+"""The certificate of an iteration's hypergradient: its quality, the conditions that it fails, and what steps are taken.
 
-An iteration takes one step for each object and each factor of psi. The solve, and the hypergradient as a whole, concern
-all steps; whether the derivative differs significantly from zero is tested for each step.
+An iteration has one step for each object and each factor of psi. Conditions on the solve, and on the hypergradient as a
+whole, concern all steps; whether the derivative differs significantly from zero is tested for each step.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ _ACTIONS: Mapping[OnUntrusted, Action] = {
 
 
 Actions = dict[str, dict[str, Action]]
-"""What happens to each step, by object and factor. A trusted step may wait, if a trust region does not take it yet."""
+"""What happens to each step, by object and factor. A trusted step ``waited`` if a trust region does not take it yet."""
 
 
 @validated
 @dataclass(frozen=True)
 class Trust:
-    """``outer.trust``: when a psi step is trusted, and what happens to one that is not.
+    """``outer.trust``: when a step of psi is trusted, and what happens to one that is not.
 
     The adjoint's own conditions are settings of ``outer.adjoint``.
 
     Args:
-        level: significance level of the test that an object's derivative by a factor is zero (see
-            ``gradient.significance``); None: not tested.
+        level: significance level of the test whether an object's derivative by a factor is zero (free steps: see
+            ``gradient.significance``; trust region: ``outer.evidence``); None: not tested.
         min_cosine: smallest cosine of the hypergradient with the finite-difference response of training (needs
             ``outer.certify_every``); None: no limit.
         on_untrusted: what happens to steps that fail: those of one object and factor if the derivative is not
-            significant, all of them if the whole hypergradient fails. ``keep`` takes them whole, as the paper does.
+            significant, all steps if the whole hypergradient fails. ``keep`` takes them in full, as the paper does.
             ``stop`` skips insignificant steps, and ends the loop if the whole hypergradient fails or no step is left.
         shrink: fraction of an untrusted step that is taken under ``on_untrusted=shrink``.
     """
@@ -59,8 +59,8 @@ class Trust:
 class ImplicitQuality:
     """The recorded numbers of an ``ImplicitAdjoint``; None for those that were not measured.
 
-    Three come from an estimated spectrum: ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme
-    Ritz values, ``condition`` is the damped operator's condition number (inf if it is not positive definite).
+    Three numbers come from an estimated spectrum: ``curvature_min`` and ``curvature_max`` are the undamped operator's
+    extreme Ritz values, ``condition`` is the damped operator's condition number (inf if it is not positive definite).
     """
 
     stationarity: float
@@ -128,13 +128,13 @@ class Certificate:
     """Quality of one iteration's hypergradient.
 
     Attributes:
-        adjoint: quality of the adjoint; None if trainings were compared instead.
+        adjoint: quality of the adjoint; None if the derivative comes from comparing trainings.
         cosine: cosine with the finite-difference response of training; None if that was not measured.
         doubts: names of the failed conditions on the whole hypergradient.
         p_values: p-values, by object and factor, of the null hypothesis that the derivative is zero. They test this
             iteration's derivative or, for trust-region steps, the average over iterations that the steps follow.
-        actions: what happens to the learned objects' steps. A step is kept if no condition fails and its derivative is
-            significant. ``waiting`` adds which steps waited.
+        actions: what happens to the learned objects' steps. A step is ``kept`` if no condition fails and its derivative
+            is significant. ``waiting`` then marks the steps that wait.
     """
 
     adjoint: Quality | None
@@ -145,16 +145,16 @@ class Certificate:
 
     @property
     def stopped(self) -> bool:
-        """True if the loop ends here."""
+        """Whether the loop ends here."""
         return "stopped" in self._taken
 
     @property
     def void(self) -> bool:
-        """Whether this iteration's derivative is discarded, from the momentum as well."""
+        """Whether this iteration's derivative is discarded, so that it does not enter the momentum either."""
         return self.stopped or (bool(self.doubts) and not self._taken & {"shrunk", "kept"})
 
     def waiting(self, steps: Collection[tuple[str, str]]) -> Certificate:
-        """Mark as waiting those of ``steps``, given as object and factor, that are trusted."""
+        """Mark those of ``steps`` (pairs of object and factor) that are kept as waiting."""
         actions: Actions = {
             name: {
                 factor: "waited" if action == "kept" and (name, factor) in steps else action
@@ -233,7 +233,7 @@ def _quality(result: Hypergradient) -> Quality | None:
 def _by_signal(
     p_values: Mapping[str, Mapping[str, float]], names: Sequence[str], factors: Sequence[str], trust: Trust
 ) -> Actions:
-    """Keep the steps of significant derivatives.
+    """Keep the steps whose derivative is significant.
 
     An object at its optimum has no significant derivative, which is no reason to stop the others: ``stop`` skips its
     step, and ends the loop only if no step is left.
@@ -251,7 +251,7 @@ def _by_signal(
 
 
 def line(certificate: Certificate, iteration: int, iterations: int, validation_loss: float) -> str:
-    """Describe an iteration in one line for the log, p-values by factor, object by object."""
+    """Describe an iteration in one line for the log, with p-values by factor and, within it, by object."""
     c = certificate
     tested = {factor: [p[factor] for p in c.p_values.values()] for p in c.p_values.values() for factor in p}
     actions = Counter(action for by_factor in c.actions.values() for action in by_factor.values())
@@ -269,11 +269,11 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Count what happened to the steps of recorded iterations.
 
-    ``steps`` counts one for each object and factor, ``waited`` the trusted steps that waited, ``untrusted`` the
-    others; ``actions`` counts what happened to these, and ``doubts`` the reasons (the failed conditions, or ``signal``:
-    no significance). ``judged`` counts objects' steps that a training accepted or rejected, ``rejected`` the latter.
-    ``taken_back`` has the objects that the loop returned to an earlier psi, with the number of their accepted steps and
-    of those that they keep. ``cosines`` lists every measured cosine.
+    ``steps`` counts all steps, one for each certified iteration, object and factor; ``waited`` counts the trusted ones
+    that waited, ``untrusted`` those that were not trusted. ``actions`` counts what happened to the latter, ``doubts``
+    the reasons: the failed conditions, or ``signal`` for a derivative that is not significant. ``judged`` counts
+    objects' steps that a training accepted or rejected, ``rejected`` only the rejected ones. ``taken_back`` has the
+    ``TakenBack`` of each object that the loop returned to an earlier psi. ``cosines`` lists every measured cosine.
     """
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [

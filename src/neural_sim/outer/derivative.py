@@ -1,4 +1,4 @@
-"""Differentiate through rendered images: losses by row, the path from psi to an image, recorded steps."""
+"""What derivatives take from the loop: losses by row, the path from psi to an image, and a recorded training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neural_sim.types import SceneDraw
 
 
 def image_losses(detector: Detector, backbone: Parameters, targets: Targets) -> ImageLoss:
-    """Return the losses of images, differentiable in their pixels."""
+    """Return the function that computes losses of images, differentiable in their pixels."""
 
     def losses(params: Parameters, chunk: Tensor, index: Tensor) -> Tensor:
         return detector.per_image_loss(params, detector.features(backbone, chunk), targets.select(index))
@@ -29,7 +29,7 @@ def image_losses(detector: Detector, backbone: Parameters, targets: Targets) -> 
 
 
 def bound_losses(cached: CachedSet, backbone: Parameters, probes: CachedSet | None) -> Losses:
-    """Return the losses of a training's images, from features and from pixels, and those of its probes."""
+    """Return the functions that compute losses of a training's images, from features and pixels, and of its probes."""
     from_images = image_losses(cached.detector, backbone, cached.targets)
     return Losses(cached.losses, from_images, probes.losses if probes else None)
 
@@ -66,7 +66,7 @@ def object_images(
 ) -> dict[str, ObjectImages]:
     """Return, by object name, the images that show the object, with their rows in the training set.
 
-    Their ``path`` is None unless draws are relaxed. ``weights`` are the weights of all images in the training loss.
+    Their pixels and ``path`` are None unless draws are relaxed. ``weights`` has the weights of all drawn images.
     """
     pixels = rendered.images.images
     bound = {}
@@ -84,13 +84,13 @@ def object_images(
 
 
 def recorded(inner: InnerLoop, trained: Trained) -> RecordedTraining:
-    """Bind a training's recorded steps to what it was trained on.
+    """Join a training's recorded steps with its training set.
 
     Raises:
         ValueError: the training was not recorded.
     """
     if trained.trajectory is None:
-        raise ValueError("unrolled: the training was not recorded; want train(..., recording=...)")
+        raise ValueError("unrolled: the training was not recorded, want train(..., recording=...)")
     examples = Examples(
         inputs=trained.examples.inputs,
         losses=trained.examples.losses_from,
@@ -103,7 +103,7 @@ def recorded(inner: InnerLoop, trained: Trained) -> RecordedTraining:
 
 
 def probe_groups(probed: ProbeSet, probes: Mapping[str, Mapping[str, Probes]]) -> ProbeGroups:
-    """Arrange the probes of learned objects, by object and factor, in tables [strata, per_bin]."""
+    """Arrange the probes of learned objects in tables [strata, per_bin], one for each object and factor."""
     tables = [part.index.view(-1, probed.per_bin) for parts in probes.values() for part in parts.values()]
     return ProbeGroups(probed.cached.losses, tables)
 

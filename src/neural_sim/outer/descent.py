@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Derived:
-    """The derivative of a training at psi. The p-values are those of all derivatives that steps follow."""
+    """The derivative of a training at psi, and the p-values of the derivatives that steps follow; see ``Steps``."""
 
     trained: Trained
     result: Hypergradient
@@ -39,13 +39,16 @@ class Derived:
 
 
 class GradientLoop(OuterLoop, ABC):
-    """One training step is one outer iteration. A subclass computes the derivative in ``_derivative``.
+    """The loop of methods with a derivative, which a subclass computes in ``_derivative``.
 
-    In a trust region, consecutive trainings use common random numbers. Each iteration begins with a training that
-    accepts or rejects the last step, and the last iteration does nothing else. Before the first derivative, the loop
-    tries the psi that ``first`` proposes, if any. Under ``outer.refine=unread``, the objects that it could estimate
-    stay there unless the training rejects their step. The loop ends early once no object has a significant derivative.
-    At the end, every object that was free to move returns to the best psi that it has had.
+    One Lightning training step is one outer iteration.
+
+    With a trust region, an iteration begins with a training that accepts or rejects the last step, with the random
+    numbers of the training before that step; the last iteration does nothing else. Before the first derivative, the
+    loop tries the psi that ``first`` proposes, if any. With ``outer.refine=unread``, objects with an estimate then stay
+    where they are, unless the training rejected their step. The loop ends early if no object is left to move, after
+    ``outer.patience`` iterations without a step to try, or if ``outer.trust`` stops it. At the end, with
+    ``steps.take_back``, every object that was free to move returns to the best psi that it has had.
     """
 
     def __init__(
@@ -104,7 +107,7 @@ class GradientLoop(OuterLoop, ABC):
         self.trajectory.append(self.psi.detach().clone())
 
     def _offer(self) -> None:
-        """Train at the initial psi, for comparison, then move to the psi that the first step proposes."""
+        """Move to the psi that the first step proposes, after a training at the initial psi for comparison."""
         steps = self.steps
         if self.first is None or not isinstance(steps, TrustRegionSteps):
             return
@@ -124,10 +127,11 @@ class GradientLoop(OuterLoop, ABC):
             self.psi.data[self._labels] = tried.reported
 
     def _settle(self, verdicts: Mapping[str, Verdict]) -> None:
-        """Hold the objects that the first step estimated at their present psi; the loop ends if these are all objects.
+        """Hold still the objects that have an estimate from the first step; if these are all objects, the loop ends.
 
-        They do not return to an earlier psi at the end either: a pair of trainings has judged them already, and an
-        estimate from the target's boxes is better evidence than scores that scatter between trainings.
+        A rejected estimate does not count. The objects held do not return to an earlier psi at the end either: a pair
+        of trainings has already judged them, and an estimate from the target's boxes is better evidence than scores
+        that scatter between trainings.
         """
         steps, rejected = self.steps, {name for name, verdict in verdicts.items() if not verdict.accepted}
         settled = read_objects(self.shown) - rejected
@@ -157,7 +161,7 @@ class GradientLoop(OuterLoop, ABC):
         return trained, verdicts
 
     def _saw(self, scores: Float[Tensor, "classes images"], names: Iterable[str]) -> None:
-        """Record a training's scores of the named objects at their present psi."""
+        """Record the named objects' scores in a training at their present psi."""
         for name in names:
             self._way = self._way.seen(name, float(scores[self.scene.names.index(name)].sum()))
 
@@ -166,7 +170,7 @@ class GradientLoop(OuterLoop, ABC):
         first = not self.records
         for trial in range(self.settings.steps.trainings if first else 1):
             if trial or not first or self._offered:
-                self.renew()  # the noise of a single training averages out over the derivatives
+                self.renew()  # so that the noise of single trainings averages out over the derivatives
             trained, result = self._differentiated()
             self.steps, p_values = self.steps.observe(result)
         return Derived(trained, result, p_values)
@@ -174,12 +178,12 @@ class GradientLoop(OuterLoop, ABC):
     def _differentiated(self) -> tuple[Trained, Hypergradient]:
         """Train at psi, and differentiate that training.
 
-        A derivative that is compared with the response uses L_val on all images, as the response does.
+        A derivative that is compared with the response uses all validation images, as the response does.
         """
         with self.timed("probes"):
             self._prepare()
         if not self.records and not self.settings.train_first:
-            # The warm start has trained at this psi, with more images and steps than an iteration.
+            # The warm start was trained at this psi, with more images and steps than an iteration.
             trained = self.charged(self.inner.untrained(self.psi, self.numbers, self.theta))
         else:
             trained = self.train_on(self.psi, self._recording)
@@ -196,7 +200,7 @@ class GradientLoop(OuterLoop, ABC):
         return trained, result
 
     def _step(self, derived: Derived) -> Certificate:
-        """Certify the derivative, and step psi as far as its certificate allows."""
+        """Certify the derivative, and take the steps of psi that the certificate allows."""
         cosine, trust = None, self.settings.trust
         with self.timed("certify"):
             if self._certifies:
@@ -215,7 +219,7 @@ class GradientLoop(OuterLoop, ABC):
 
     @property
     def _certifies(self) -> bool:
-        """True if this iteration compares its derivative with the response of training."""
+        """Whether this iteration compares its derivative with the response of training."""
         every = self.settings.certify_every
         return every > 0 and (len(self.records) + 1) % every == 0
 
@@ -263,7 +267,7 @@ class GradientLoop(OuterLoop, ABC):
     @override
     def restore(self, state: Mapping[str, Any]) -> None:
         self._before_folds = state["before_folds"]
-        if state["folds"]:  # folds are popped from the end, so that the first ones are left
+        if state["folds"]:  # folds are popped from the end: the first ones are left
             self.numbers.generator.set_state(self._before_folds)
             count = self.settings.steps.folds
             self._folds = self.inner.objective.folds(count, self.numbers.generator)[: state["folds"]]
@@ -277,10 +281,10 @@ class GradientLoop(OuterLoop, ABC):
 
     @abstractmethod
     def _derivative(self, trained: Trained, objective: Objective) -> Hypergradient:
-        """Compute d objective/dpsi of the learned objects, zeros for the others."""
+        """Compute the objective's derivative by the psi of the learned objects; it is zero for the others."""
 
     def _cosine(self, result: Hypergradient) -> float | None:
-        """Compare the derivative with an independent reference; None if there is none."""
+        """Compute the cosine of the derivative with an independent reference; None if there is none."""
         return None
 
 
@@ -297,9 +301,7 @@ def learned_objects(inner: InnerLoop) -> LearnedObjects:
     if wanted is not None:
         labels = [label for label, name in enumerate(names) if name in wanted]
     elif not inner.shown:
-        raise ValueError(
-            "the target's validation images show none of the objects, so that psi cannot be learned"
-        )
+        raise ValueError("the target's validation images show none of the objects, so psi cannot be learned")
     else:
         labels = sorted(inner.shown)
         unseen = [name for label, name in enumerate(names) if label not in inner.shown]

@@ -13,14 +13,15 @@ from torch import Tensor
 class Average:
     """Weighted mean of derivatives by p, object by object; weights are inverse variances and decay as psi moves.
 
-    The weights keep noisy derivatives, which are long, and the first one from dominating. A derivative's variance is
-    the sum of the variance over the images it was computed from and ``between``, the variance between trainings (which
-    differ in initial parameters, batches and images). A derivative with a component that is not finite is ignored.
+    Inverse variances keep noisy derivatives, which are long, from dominating the mean; the decay discounts those that
+    were taken at an earlier psi. A derivative's variance has two parts: its variance over the images from which it was
+    computed, and ``between``, the variance between trainings, which differ in random numbers and images. A derivative
+    with a component that is not finite is ignored.
 
     Attributes:
         directions: the derivatives.
         variances: their variances over images.
-        moves: how often the object has moved since.
+        moves: number of moves of the object since each derivative.
         momentum: factor on a derivative's weight for every move.
     """
 
@@ -31,7 +32,7 @@ class Average:
 
     @staticmethod
     def zeros(psi: Float[Tensor, "objects k"], momentum: float = 1.0) -> Average:
-        """Begin without a derivative."""
+        """Return a mean without derivatives yet."""
         nothing = psi.new_zeros(0, *psi.shape)
         return Average(nothing, nothing, nothing[..., 0].long(), momentum)
 
@@ -47,7 +48,7 @@ class Average:
         )
 
     def moved(self, objects: Bool[Tensor, "objects"]) -> Average:
-        """Decay the derivatives of the ``objects`` that have moved."""
+        """Discount the derivatives of the ``objects`` that have moved."""
         return replace(self, moves=self.moves + objects.long())
 
     @property
@@ -55,9 +56,9 @@ class Average:
         """Variance of a component between trainings; 0 if no object has two derivatives at one psi.
 
         It is estimated from the scatter of an object's derivatives at one psi, less their variance over images. A
-        prior counts as one more pair of derivatives for each object: the median, over objects, of the ratio of the
-        variance between trainings to that over images. It is a ratio because objects' derivatives differ in size, and
-        a median so that one object with wildly scattered derivatives does not mask the others.
+        prior counts as one more pair of derivatives for each object. It is the median, over objects, of the ratio of
+        the variance between trainings to that over images: a ratio because derivatives of different objects differ in
+        size, a median so that one object with wildly scattered derivatives does not hide the signal of the others.
         """
         excess, freedom = self._excess
         if not bool((freedom > 0).any()):
@@ -73,7 +74,7 @@ class Average:
 
     @property
     def _excess(self) -> tuple[Float[Tensor, "objects"], Float[Tensor, "objects"]]:
-        """Squared deviations of derivatives from their mean at one psi, less image noise, and degrees of freedom."""
+        """Squared deviations of derivatives from their mean at one psi, less the images' part; degrees of freedom."""
         known = self.variances.isfinite().all(2)
         excess = torch.zeros_like(self.directions[:1].sum((0, 2)))
         freedom = torch.zeros_like(excess)
@@ -97,7 +98,7 @@ class Average:
 
     @property
     def value(self) -> Float[Tensor, "objects k"]:
-        """The mean; zeros without a derivative."""
+        """The mean; zero without a derivative."""
         weights = self._weights
         total = weights.sum(0).clamp_min(torch.finfo(weights.dtype).tiny)
         return (weights * self.directions).sum(0) / total
@@ -116,7 +117,7 @@ class Average:
         """P-values of the null hypothesis that all components of the mean are equal.
 
         They come from a chi-square test with k - 1 degrees of freedom, with components weighted by their inverse
-        variances. A p-value is 1 without observations and 0 without noise.
+        variances. A mean without variance has p-value 0 if it is not zero, otherwise 1; 1 also without derivatives.
         """
         value, variance = self.value, self.variance
         exact = (variance == 0.0).all(1)

@@ -54,7 +54,7 @@ class WhatTheTargetShows(FirstStep):
     Attributes:
         settings: settings of the estimate.
         groups: bins that look the same.
-        whole: use whole images, because there are no boxes.
+        whole: use whole images instead of boxes, for classification.
     """
 
     settings: LabelShift
@@ -86,6 +86,6 @@ def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:
 
 
 def read_objects(factors: Sequence[FactorEstimate]) -> set[str]:
-    """Return the names of the objects for which every factor has an estimate, whether psi moves there or stays."""
+    """Return the names of the objects with a usable estimate of every factor, whether or not psi moves there."""
     unread = {one.name for one in factors if one.finding not in ("moves", "stays")}
     return {one.name for one in factors} - unread

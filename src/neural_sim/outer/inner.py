@@ -40,18 +40,18 @@ def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterat
 
 
 def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bool:
-    """Tell whether images come from a pool: they do if no image is differentiated and the light is fixed."""
+    """Tell whether images come from a pool, which needs ``pool_per_bin`` above 0, hard draws and a fixed light."""
     return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and not distribution.lights
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """The source of random numbers of trainings.
+    """The random numbers of trainings.
 
     Attributes:
         generator: the loop's generator.
         common: whether all draws and trainings use the same random numbers, so that they differ by psi alone.
-        index: number of the set of common random numbers in use.
+        index: which set of common random numbers is in use.
     """
 
     generator: torch.Generator
@@ -59,7 +59,7 @@ class Numbers:
     index: int = 0
 
     def of(self, purpose: str) -> torch.Generator:
-        """Return the generator for a training's ``images``, or for the ``training`` itself."""
+        """Return the generator for a training's ``images`` or for the ``training`` itself."""
         return stream(self.index, f"common {purpose}", self.generator) if self.common else self.generator
 
     def renewed(self) -> Numbers:
@@ -73,8 +73,8 @@ class RenderedPool:
 
     Attributes:
         scene: the scene of the pooled renders.
-        state: the generator's state after them, so that a loop given this pool continues with the same draws.
-        spent: cost of rendering them.
+        state: the generator's state after the renders, from which a loop with this pool continues.
+        spent: cost of the renders.
     """
 
     scene: Scene
@@ -83,7 +83,7 @@ class RenderedPool:
 
     @staticmethod
     def of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: bool = False) -> RenderedPool:
-        """Render a pool (``pool_of``)."""
+        """Render a pool; see ``pool_of``."""
         began, cpu_began = time.perf_counter(), time.process_time()
         pool = pool_of(scene, per_bin, generator, lights=lights)
         synchronise(pool.subjects[0].device)
@@ -99,8 +99,8 @@ class LoopInputs:
         detector: the detector.
         params: its warm start, on the device of the scene's fields, where the loop trains.
         validation: the labelled validation set, on any device; the loop sees no other images of the target.
-        photographs: labelled photographs that train with the drawn images, as ``training.real`` says.
-        pool: a pool that was already rendered by the loop's generator; None: the loop renders its own if it needs one.
+        photographs: labelled photographs on which the loop trains in addition, as ``training.real`` says.
+        pool: a pool that was rendered earlier with the loop's generator; None: the loop renders one if it needs it.
     """
 
     detector: Detector
@@ -120,7 +120,7 @@ class Trained:
         examples: the training set: these images and the photographs, passed through the backbone.
         theta: the detector's parameters.
         trainable: the part of them that is trained.
-        loss: mean training loss of the last epoch; nan without epochs.
+        loss: mean training loss of the last epoch, or the loss of a detector trained elsewhere; nan without epochs.
         trajectory: the steps, if they were recorded.
         objective: L_val.
         cost: images and steps.
@@ -160,8 +160,8 @@ class InnerLoop:
 
     The backbone is the one in ``params``, frozen except for its last ``settings.loop_layers`` stages. These stages, the
     pyramid and the head are trained for ``settings.epochs`` epochs at a time, or more if ``settings.least_steps``
-    requires it. Relaxed draws, and images whose light is learned, are rendered for every training; all others come from
-    a pool of poses in every bin.
+    requires it. Images of relaxed draws, or with a light that is learned, are rendered for every training; all others
+    come from a pool of renders of every bin (``settings.pool_per_bin``).
 
     Attributes:
         scene: the scene from which images are drawn.
@@ -169,11 +169,11 @@ class InnerLoop:
         params: its warm start.
         start: initial parameters of a training that does not continue the previous one.
         objective: L_val.
-        photographs: the photographs that train with the drawn images.
+        photographs: the photographs on which it trains in addition to the drawn images.
         settings: settings of the psi loop.
         training: batch size and weight decay.
         draws: how the method draws images.
-        pool: the scene with poses that were rendered once, if there is one.
+        pool: the scene with renders that are made once, if there is one.
         preparation: cost of rendering the pool.
     """
 
@@ -237,7 +237,7 @@ class InnerLoop:
 
     @property
     def shown(self) -> set[int]:
-        """Classes that some validation image shows."""
+        """The classes that validation images show."""
         labels = self.objective.images.labels
         return set(labels[labels >= 0].tolist())
 
@@ -248,12 +248,12 @@ class InnerLoop:
         return rendered.without_maps() if isinstance(self.draws, HardDraws) else rendered
 
     def training_set(self, images: LabelledImages) -> CachedSet:
-        """Join drawn images and, after them, the photographs that train with them, passed through the backbone."""
+        """Pass drawn images through the backbone, and append the photographs, if there are any."""
         drawn = CachedSet.of(self.detector, self.backbone, images)
         return drawn if self.photographs is None else CachedSet.concatenate([drawn, self.photographs])
 
     def weights(self, examples: CachedSet) -> Float[Tensor, "N"]:
-        """Return the examples' weights in the training loss, on the CPU: 1 / N, or as photographs are mixed in."""
+        """Return the examples' weights in the training loss, on the CPU: 1 / N each, unless photographs are added."""
         sampling = self._sampling(examples)
         return torch.full((len(examples),), 1.0 / len(examples)) if sampling is None else sampling.weights
 
@@ -276,7 +276,7 @@ class InnerLoop:
             psi: the images are drawn from p_psi.
             numbers: random numbers of the draws and the training.
             theta: initial parameters if ``settings.start=previous``; None: the warm start.
-            recording: which of the steps are recorded.
+            recording: which steps are recorded; None: none.
         """
         theta = self.params if theta is None else theta
         seconds: dict[str, float] = {}
@@ -309,7 +309,7 @@ class InnerLoop:
         sampling = self._sampling(examples)
         how = self.training.of(self._epochs(len(examples), sampling))
         how = replace(how, learning_rate=self.settings.learning_rate)
-        # The proximal term replaces weight decay: with both, the inner problem would have another Hessian.
+        # The proximal term replaces weight decay, which the Hessian of the inner problem does not include.
         if self.detector.proximal > 0.0:
             how = replace(how, weight_decay=0.0)
         start = theta if self.settings.start == "previous" else self.start

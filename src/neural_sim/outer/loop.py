@@ -1,4 +1,4 @@
-"""The base class of all outer loops (psi, costs, records, the Trainer), and the loop of methods with rewards."""
+"""The base class of all outer loops, the loop of methods with rewards, and ``learn_psi``, which runs a loop."""
 
 from __future__ import annotations
 
@@ -33,12 +33,14 @@ logger = logging.getLogger(__name__)
 
 
 class OuterLoop(pl.LightningModule):
-    """psi [objects, K] with all factors of p_psi; one training step is one of ``rounds`` outer iterations.
+    """A loop over psi [objects, K], with all factors of p_psi joined.
+
+    One Lightning training step is one of ``rounds`` outer iterations.
 
     ``inner`` draws an iteration's images and trains the detector on them with the random ``numbers``; ``theta`` has
-    the parameters of the last training, from which the next may continue. A subclass's ``training_step`` ends with
-    ``record``; after the step of psi, it appends to ``trajectory`` the psi that the method would return at this point.
-    ``shown`` is the estimate from the target's boxes, if one was made.
+    the parameters of the last training, from which the next may continue. A subclass's ``training_step`` calls
+    ``record``, sets psi, and appends to ``trajectory`` the psi that the method would return at this point. ``shown`` is
+    the estimate from the target's boxes, if one was made.
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class OuterLoop(pl.LightningModule):
         return None
 
     def train_dataloader(self) -> range:
-        """Count the iterations that are left; they need no data."""
+        """Return the numbers of the remaining iterations, which need no data."""
         return range(len(self.records), self.rounds)
 
     @property
@@ -81,9 +83,9 @@ class OuterLoop(pl.LightningModule):
         self._cpu += time.process_time() - begun
 
     def state(self) -> dict[str, Any]:
-        """Return everything that an iteration passes on: psi, records, random numbers, the detector's parameters.
+        """Return everything that an iteration passes on to the next, such as psi, records and random numbers.
 
-        Whatever follows from the loop's inputs, such as its pool, is left out.
+        What follows from the loop's inputs, such as its pool, is left out.
         """
         return {
             "psi": self.psi.data,
@@ -96,7 +98,7 @@ class OuterLoop(pl.LightningModule):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from the ``state`` of a loop with the same inputs; this loop must not have begun."""
+        """Continue from the ``state`` of a loop with the same inputs; this loop must not have started."""
         self.psi.data = state["psi"]
         self.records, self.trajectory, self.shown = state["records"], state["trajectory"], state["shown"]
         self.theta = placed(state["theta"], self.inner.device)
@@ -105,7 +107,7 @@ class OuterLoop(pl.LightningModule):
         self._seconds, self._cpu = {}, time.process_time()
 
     def renew(self) -> None:
-        """Change the common random numbers."""
+        """Switch to the next set of common random numbers."""
         self.numbers = self.numbers.renewed()
 
     def train_on(self, psi: Float[Tensor, "objects K"], recording: Recording | None = None) -> Trained:
@@ -121,7 +123,7 @@ class OuterLoop(pl.LightningModule):
         return trained
 
     def charge(self, cost: Cost) -> None:
-        """Add images, detector steps and Hessian products to the iteration's."""
+        """Add a cost to the iteration's."""
         self._cost = self._cost + cost
 
     def timed(self, phase: str) -> AbstractContextManager[None]:
@@ -185,7 +187,7 @@ class OuterLoop(pl.LightningModule):
 
 
 class RewardLoop(OuterLoop):
-    """The outer loop of methods that see only a reward: draw, train, reward. One training step is one round.
+    """The outer loop of methods that see only a reward: draw, train, reward. One Lightning training step is one round.
 
     The reward is minus L_val, which still varies where AP is zero.
     """
@@ -230,7 +232,7 @@ def learn_psi(
     Args:
         module: the loop, not yet run.
         on_record: called with the record of each iteration when it ends.
-        checkpoint: where to resume from, and what to write after each iteration.
+        checkpoint: where to resume from, and where to save the state after an iteration.
     """
     if on_record is not None:
         module.on_record = on_record
@@ -239,7 +241,7 @@ def learn_psi(
     if state is not None:
         module.restore(state)
         logger.info(
-            "psi loop: resumes after round %d/%d of an interrupted run", len(module.records), module.rounds
+            "psi loop: resuming an interrupted run after round %d/%d", len(module.records), module.rounds
         )
         for record in module.records:
             module.on_record(record)

@@ -71,11 +71,11 @@ class SimulatorModule(GradientLoop):
             len(trained.rendered),
             self.settings.adjoint,
         )
-        # Drawn for every adjoint, so that later random numbers do not depend on which one is chosen.
+        # Drawn for every kind of adjoint, so that later random numbers do not depend on the kind.
         implicit = adjoint if isinstance(adjoint, Implicit) else Implicit()
         subset, own = curvature_rows(drawn, weights, implicit.curvature_images, self.numbers.generator)
         if isinstance(adjoint, Unrolled):
-            # Each step reads the fraction of photographs off its batch, see Examples.drawn.
+            # Photographs do not count here: each step takes their fraction from its batch, see Examples.drawn.
             images = self._images(trained, torch.full((drawn,), 1.0 / drawn))
             return self._with_fixed(self._through_training(trained, objective, images, adjoint))
         device = self.inner.device
@@ -144,7 +144,7 @@ class SimulatorModule(GradientLoop):
         return result
 
     def _with_fixed(self, result: Hypergradient) -> Hypergradient:
-        """Add zeros for the objects whose psi is fixed, for which nothing was computed."""
+        """Add zeros for the objects whose psi is fixed."""
         zeros = {name: torch.zeros(self.psi.shape[1]) for name in self.scene.names}
         return replace(
             result,

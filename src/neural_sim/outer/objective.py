@@ -1,4 +1,4 @@
-"""The outer objective L_val: a loss of the trained detector on the validation images, and its parts by class."""
+"""The outer objective L_val, a loss or score of the trained detector on validation images, and its parts by class."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Objective:
     score: SmoothAP | SmoothAccuracy | Loss
 
     def folds(self, count: int, generator: torch.Generator) -> list[Objective]:
-        """Split L_val into disjoint random parts of the validation images, ``count`` of them or one for each image.
+        """Split L_val by dividing the validation images at random into ``count`` parts, or fewer if images are fewer.
 
         The parts have the same number of images of every class (the class of an image's first box), give or take one.
         """
@@ -62,7 +62,7 @@ class Objective:
         return 1.0 - score.sum(1).nanmean() + self.score.loss * loss
 
     def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
-        """Run the detector on all images. A backward pass recomputes intermediate values chunk by chunk."""
+        """Run the detector on all images; a backward pass recomputes intermediate values chunk by chunk."""
         parts = [
             checkpoint(self.cached.outputs, params, rows, use_reentrant=False)
             for rows in torch.arange(len(self.cached), device=self.cached.device).split(chunk_size)
@@ -74,8 +74,8 @@ class Objective:
     def scores(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
         """Compute each image's contribution to the score of every class, on the CPU; higher is better.
 
-        A class's score, the sum of its row, is minus its part of L_val (up to the constant one). Losses are averaged
-        over the images with a box of the class; a class without a box is nan.
+        A class's score, the sum of its row, is minus its part of L_val (up to the constant 1), except that its losses
+        are averaged over the images with a box of the class. A class without a box is nan.
         """
         labels = self.images.labels.cpu()
         losses = self.cached.detector.losses_of(outputs, self.cached.targets).cpu()

@@ -1,4 +1,4 @@
-"""Predict, to first order, what an optimisation would gain from steps of psi and from labelled photographs."""
+"""Predict, to first order, what steps of psi would gain, and measure what labelled photographs gain."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ExpectedGains:
-    """The fall of L_val to be expected, to first order, from moving one object's psi in one factor.
+    """The expected fall of L_val, to first order, if one factor of one object's psi moves.
 
     Attributes:
         name: the object.
         factor: the factor of psi.
         p_value: p-value of the null hypothesis that the derivative is zero.
         moved: fraction of the object's images that moves to a bin.
-        by_bin: fall of L_val if they move to each bin (or light), while all other bins lose in proportion.
+        by_bin: fall of L_val if they move to each bin (or light) from all bins, in proportion to their p.
         by_bin_error: standard errors of ``by_bin``.
         step: fall of L_val from a step of the loop along the derivative.
         step_error: standard error of ``step``.
@@ -48,7 +48,9 @@ class ExpectedGains:
 
 
 def expected_gains(loop: GradientLoop, trials: int, moved: float) -> list[ExpectedGains]:
-    """Average the derivative at psi over ``trials`` trainings with new random numbers; psi does not move.
+    """Predict gains from the derivative at psi, averaged over ``trials`` trainings with different random numbers.
+
+    psi does not move.
 
     Raises:
         ValueError: there is no trial, or the fraction is outside (0, 1].
@@ -77,7 +79,7 @@ def gains_of(
     moved: float,
     region: TrustRegion,
 ) -> list[ExpectedGains]:
-    """Average derivatives at one psi, and compute the gains of a step in ``region``; see ``expected_gains``."""
+    """Average derivatives at one psi, and compute the gains of moves and of a step in ``region``."""
     parts, found = distribution.split(psi), []
     for factor in distribution.factors:
         own = parts[factor.name]
@@ -110,7 +112,7 @@ def _along(change: Tensor, direction: Tensor, variance: Tensor) -> tuple[Tensor,
 
 @dataclass(frozen=True)
 class PhotographGain:
-    """How far L_val falls when photographs are added to training images of the initial distribution.
+    """How far L_val falls if photographs are added to the training images.
 
     Attributes:
         photographs: number of photographs.
@@ -129,7 +131,7 @@ def photograph_gains(
     """Train as the loop does at its psi, without photographs and with each of ``counts``; psi does not move.
 
     Photographs are half of every batch, drawn repeatedly. The trainings of a trial share their random numbers, so that
-    their differences are due to the photographs alone. Counts above the number of photographs are reduced to it.
+    only the photographs make them differ. Counts above the number of photographs are reduced to it.
 
     Raises:
         ValueError: there is no trial, or a count is below 1.
@@ -162,7 +164,7 @@ def _gain(count: int, without: Sequence[float], with_them: Sequence[float]) -> P
 
 
 def equivalent(gains: Sequence[PhotographGain], fall: float) -> float | None:
-    """Interpolate the number of photographs at which L_val falls this far; None: more than were tried."""
+    """Interpolate the number of photographs at which L_val falls this far; None: more than were tried are needed."""
     before = PhotographGain(0, 0.0, None)
     for gain in sorted(gains, key=lambda g: g.photographs):
         if gain.fall >= fall:

@@ -20,12 +20,12 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ProbeSet:
-    """Stratified samples: images of every bin of every factor of every object, with their features.
+    """Stratified samples: images of every bin of every factor of the learned objects, with their features.
 
     The bins of an illumination factor are its anchor lights.
 
     Attributes:
-        probes: rows of ``cached``, bin after bin, by object and factor name; empty for objects left out.
+        probes: for each object, by factor, its rows of ``cached``, bin after bin; empty for objects left out.
         cached: the images' features.
         per_bin: number of images in every bin.
     """
@@ -44,7 +44,7 @@ class ProbeSet:
         generator: torch.Generator,
         objects: Sequence[int],
     ) -> ProbeSet:
-        """Draw probes of some ``objects``; all factors except the stratified one are drawn from p_psi."""
+        """Draw probes of the given ``objects``; all factors except the stratified one are drawn from p_psi."""
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
 
         def drawn() -> Iterator[LabelledImages]:
@@ -60,7 +60,7 @@ class ProbeSet:
         return ProbeSet(probes, CachedSet.streamed(detector, backbone, drawn()), per_bin)
 
     def state(self) -> dict[str, Any]:
-        """Return the probes as tensors and numbers on the CPU, see ``of``."""
+        """Return the probes as tensors on the CPU and numbers, from which ``of`` restores them."""
         cached = self.cached
         return {
             "rows": [{name: (p.index, p.bins) for name, p in own.items()} for own in self.probes],
@@ -71,20 +71,20 @@ class ProbeSet:
 
     @staticmethod
     def of(state: Mapping[str, Any], detector: Detector, device: torch.device) -> ProbeSet:
-        """Return the probes of a ``state``, with their features on ``device``."""
+        """Restore the probes of a ``state``, with their features on ``device``."""
         features = tuple(level.to(device) for level in state["features"])
         targets = Targets(*(part.to(device) for part in state["targets"]))
         probes = [{name: Probes(*rows) for name, rows in own.items()} for own in state["rows"]]
         return ProbeSet(probes, CachedSet(detector, features, targets), state["per_bin"])
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
-        """Replace ``fresh.per_bin`` probes of every bin, at the places whose turn it is in the iteration ``turn``.
+        """Replace ``fresh.per_bin`` probes of every bin, those whose turn it is in the iteration ``turn``.
 
         Raises:
-            ValueError: there are more fresh probes for a bin than places.
+            ValueError: there are more fresh probes of a bin than it has.
         """
         if fresh.per_bin > self.per_bin:
-            raise ValueError(f"probes: got {fresh.per_bin} fresh ones a bin for {self.per_bin} places")
+            raise ValueError(f"probes: want at most {self.per_bin} fresh ones per bin, got {fresh.per_bin}")
         places = (turn * fresh.per_bin + torch.arange(fresh.per_bin)) % self.per_bin
         targets, sources, probes = [], [], []
         for old, new in zip(self.probes, fresh.probes, strict=True):

@@ -1,4 +1,4 @@
-"""The line that an iteration of the loop prints: what happened, in words, and the time left."""
+"""The line that each iteration of the loop prints: what happened, in words, and the time left."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ def iteration_line(
     if last.certificate is not None:
         parts.extend(_next_steps(last.certificate))
     parts.extend(
-        f"{name} goes back to its best psi ({back.kept} of {back.accepted} steps stay)"
+        f"{name} goes back to its best psi ({back.kept} of {back.accepted} accepted steps kept)"
         for name, back in last.taken_back.items()
     )
     time = duration(seconds)
     if left is not None:
         time += f", about {duration(left)} left"
     elif len(records) < iterations:
-        time += "; the loop ends here, for no step is left to try"
+        time += "; the loop ends here, because no step is left to try"
     return "; ".join([*parts, time])
 
 
 def _next_steps(certificate: Certificate) -> list[str]:
-    """Name the objects that move now, and count those that wait or have no significant derivative."""
+    """Name the objects that move now and those that wait, and count those without a significant derivative."""
     if certificate.doubts:
         return [f"derivative not trusted: {', '.join(certificate.doubts)}"]
     actions = {name: set(by_factor.values()) for name, by_factor in certificate.actions.items()}
@@ -51,13 +51,13 @@ def _next_steps(certificate: Certificate) -> list[str]:
     still = len(actions) - len(moving) - len(waiting)
     return [
         *([f"tries {', '.join(moving)}"] if moving else []),
-        *([f"wait for these: {', '.join(waiting)}"] if waiting else []),
+        *([f"waiting: {', '.join(waiting)}"] if waiting else []),
         *([f"no signal: {still}"] if still else []),
     ]
 
 
 def duration(seconds: float) -> str:
-    """Write a duration as one would say it: 24 s, 3 min, 2 h 5 min."""
+    """Format a duration: 24 s, 3 min, 2 h 5 min."""
     if seconds < 99.5:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

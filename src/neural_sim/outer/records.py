@@ -19,8 +19,8 @@ from neural_sim.outer.way import TakenBack
 class Cost:
     """Cost of a method or a training.
 
-    It consists of labelled images, optimiser steps of detectors, Hessian products, seconds of wall-clock time, and
-    processor seconds over all cores.
+    It counts labelled images, optimiser steps of detectors, Hessian products, wall-clock seconds, and processor seconds
+    over all cores.
     """
 
     images: int = 0
@@ -41,11 +41,11 @@ class Cost:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The decisions of an iteration's trainings about steps.
+    """What an iteration's trainings decided about earlier steps.
 
     Attributes:
         verdicts: verdicts on the objects whose last step was accepted or rejected.
-        taken_back: at the end, the objects whose best psi was not their last one.
+        taken_back: at the end, the objects that go back because their best psi was not the last one.
     """
 
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
@@ -58,12 +58,11 @@ class IterationRecord:
 
     ``probabilities`` and ``entropies`` (nats), by factor and object, describe the distribution from which the images
     were drawn, before the step. ``gradient_norms`` and ``gradient_errors`` are, by object, the norms of dL_val/dpsi and
-    of its standard errors; empty without a derivative. ``images`` counts labelled images, probes included,
+    of its standard errors; empty without a derivative. ``images`` counts labelled images, including probes,
     ``detector_steps`` optimiser steps and ``products`` Hessian products. ``seconds`` are wall-clock times by phase;
-    ``cpu_seconds``, the processor time over all cores, is affected less by other processes on the machine.
-    ``certificate`` is None for methods without a hypergradient, and in an iteration that computes none. ``scores``
-    [classes] are the scores of the loop's objective; higher is better. For ``verdicts`` and ``taken_back`` see
-    ``Outcome``.
+    ``cpu_seconds``, the processor time over all cores, depends less on other processes on the machine. ``certificate``
+    is None for methods with rewards, and in an iteration without a derivative. ``scores`` [classes] are those of the
+    loop's objective; higher is better. For ``verdicts`` and ``taken_back`` see ``Outcome``.
     """
 
     probabilities: dict[str, list[list[float]]]
@@ -85,14 +84,14 @@ class IterationRecord:
 
 
 def cost_of(record: IterationRecord) -> Cost:
-    """Sum up the cost of one iteration. Phases ``hypergradient_*`` are parts of ``hypergradient``."""
+    """Return the cost of one iteration. Phases ``hypergradient_*`` are parts of ``hypergradient``, counted once."""
     phases = record.seconds.items()
     seconds = sum(spent for phase, spent in phases if not phase.startswith("hypergradient_"))
     return Cost(record.images, record.detector_steps, record.products, seconds, record.cpu_seconds)
 
 
 def record_of(stored: Mapping[str, Any]) -> IterationRecord:
-    """Invert ``dataclasses.asdict`` for a record."""
+    """Restore a record from its ``dataclasses.asdict``."""
     certificate = stored["certificate"]
     return IterationRecord(
         **{
@@ -117,9 +116,9 @@ class LearnedPsi:
     """The result of the loop.
 
     ``trajectory`` has the method's psi before the first iteration and after each. A trust-region step enters it at once
-    and is undone an iteration later if it is rejected; the last entry has the best psi of every object.
-    ``before`` is the cost before the first iteration: that of the warm start, whose backbone every loop uses, or of the
-    estimate ``shown`` for a method that estimates psi from the target.
+    and is undone an iteration later if it is rejected; the last entry is the psi that the loop returns. ``before`` is
+    the cost before the first iteration: that of the warm start, whose backbone every loop uses, or of the estimate
+    ``shown`` for a method that estimates psi from the target.
     """
 
     trajectory: Float[Tensor, "psis objects K"]
@@ -128,7 +127,7 @@ class LearnedPsi:
     shown: tuple[FactorEstimate, ...] = ()
 
     def cost(self, iterations: int) -> Cost:
-        """Sum up the cost up to the given number of iterations; zero for none, because the initial psi is free."""
+        """Sum the cost up to a number of iterations; it is 0 for none, because the initial psi is free."""
         return sum(
             (cost_of(record) for record in self.records[:iterations]), self.before if iterations else Cost()
         )

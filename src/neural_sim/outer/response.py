@@ -1,9 +1,9 @@
 """The finite-difference response of training: how an object's score changes when its images move to one bin.
 
 No derivative is computed. The training is repeated, with common random numbers, once for each bin of a factor. Each run
-moves all objects at once, each to a different bin, and measures each object's response by its score. The response is
-the reference for hypergradients of the loop's training, and a method of its own (``baseline=response``). It costs one
-training for each bin.
+moves all objects at once, consecutive ones to different bins, and measures each object's response by its score. The
+response is the reference for hypergradients of the loop's training, and a method of its own (``baseline=response``). It
+costs one training at psi, and one for each bin of each factor.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from neural_sim.parameter.factor import Factor
 PART = 0.15
 """Fraction of an object's images that move to the bin."""
 SPACING = 3
-"""Distance between the bins of consecutive objects in one run, so that pairs of bins differ from run to run."""
+"""Distance between the bins of consecutive objects in one run, so that objects move to different bins."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Response:
     cost: Cost = field(default_factory=Cost)
 
     def slopes(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "objects K"]:
-        """Compute the derivative by psi that the response implies, for L_val = minus the mean score over classes."""
+        """Compute the derivative by psi that the response implies, where L_val is minus the mean score over classes."""
         distribution, parts = inner.scene.distribution, {}
         values, at = distribution.split(self.value), distribution.split(psi)
         for factor in distribution.factors:
@@ -106,8 +106,8 @@ def agreement(
     """Compare derivatives at ``psi`` with the ``slopes`` of the response.
 
     Returns:
-        The cosine of the centred derivatives by p, averaged over learned objects and factors; None if all of them
-        vanish.
+        The cosine of the centred derivatives by p, averaged over learned objects and factors; None if it is undefined
+        for all of them, because a derivative vanishes.
     """
     distribution = objects.distribution
     truth = distribution.split(slopes)
@@ -149,7 +149,7 @@ class ResponseLoop(GradientLoop):
         gradients = {
             name: slopes[i] if i in self.objects.labels else zero for i, name in enumerate(self.scene.names)
         }
-        # Its noise is unknown; the training at the new psi decides on each step.
+        # The errors are unknown and taken as 0, so that only the training at the new psi decides on each step.
         return Hypergradient(gradients, dict.fromkeys(gradients, zero), None)
 
 

@@ -29,8 +29,8 @@ class Outer:
 
     Args:
         iterations: largest number of outer iterations.
-        patience: number of consecutive iterations without a step to try after which a trust region's loop ends; None:
-            all iterations are run.
+        patience: number of consecutive iterations without a step to try, after which a loop with a trust region ends;
+            None: all iterations are run.
         images_per_object: number of training images of each object in an iteration.
         epochs: epochs of an iteration's training.
         learning_rate: peak learning rate of that training.
@@ -41,27 +41,27 @@ class Outer:
             start's values; the others are frozen. None: as many as the detector proposes (``Detector.in_loop``).
         start: initial pyramid and head of that training: those of the previous iteration (``previous``, the paper's),
             of the warm start (``warm``), or untrained ones, always the same (``fresh``). A detector that continues
-            remembers bins that psi has left, so that their loss stays low; an untrained one depends on the distribution
-            alone.
+            remembers bins that psi has left, so that their loss stays low; what an untrained one learns depends on the
+            present distribution alone.
         train_first: train before the first hypergradient; otherwise it is taken at the warm start.
-        pool_per_bin: number of poses of every bin that are rendered once and then composited onto new backgrounds; 0:
-            every image is rendered for itself, as always with the pathwise estimator, which replays exact draws.
-        refresh: fraction of the probes that an iteration replaces. The others keep their images, with the values that
-            the other factors of p_psi had when they were drawn.
-        quality: quality of the loop's renders; None: the renderer's own, which the scored detectors always train on.
+        pool_per_bin: number of renders of every bin that are made once and then composed with new backgrounds; 0: every
+            image is rendered anew, as always if images are differentiated (``gradient=pathwise``) or psi has lights.
+        refresh: fraction of the probes that an iteration replaces. The others keep their images, whose other factors
+            follow the psi at which they were drawn.
+        quality: quality of the loop's renders; None: the renderer's own, at which the images of scored detectors are
+            always rendered.
         learned: names of the objects whose psi a hypergradient moves; None: all that validation images show. The others
             get no probes and no second derivatives.
         certify_every: number of iterations between comparisons of the hypergradient with the finite-difference response
             of training at the same psi (``outer.response``, one training for each bin); 0: never.
-        refine: which objects take steps along derivatives after the first step: ``all``, or only those that it could
-            not estimate or whose estimate a training rejected (``unread``).
-        first_step: how the loop chooses the psi that it tries first: along the first derivative, or by an estimate from
-            the target's boxes.
-        steps: how psi follows its derivative: freely, or in a trust region. The latter uses common random numbers, and
-            its last iteration only trains, to accept or reject the last step.
+        refine: which objects take steps along derivatives after the first step: ``all``, or only those (``unread``)
+            that it could not estimate, or whose estimate a training rejected.
+        first_step: where the loop goes first: along the first derivative, or to an estimate from the target's boxes.
+        steps: how psi follows its derivative: freely, or in a trust region. A trust region uses common random numbers,
+            and its last iteration only trains, to accept or reject the last step.
         adjoint: the hypergradient of the training that was run, or that at a stationary point (the paper's Eq. 2).
-        objective: what is minimised on the validation images: one minus a smooth average precision, or a classifier's
-            smooth accuracy, or their loss (the paper's).
+        objective: what is minimised on the validation images: one minus a smooth average precision, one minus a
+            classifier's smooth accuracy, or their loss (the paper's).
         trust: conditions on the hypergradient.
 
     Raises:
@@ -98,7 +98,7 @@ class Outer:
             )
         if not isinstance(self.first_step, Derivative) and not isinstance(self.steps, TrustRegion):
             raise UserError(
-                "outer/first_step: a training accepts or rejects what is proposed: want outer/steps=trust_region with "
+                "outer/first_step: a training must accept or reject the proposal: want outer/steps=trust_region with "
                 "it, or outer/first_step=derivative"
             )
         if isinstance(self.adjoint, Unrolled) and not trains:

@@ -24,7 +24,7 @@ PValues = Mapping[str, Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a training at the new psi accepted an object's step; a rejected step is taken back.
+    """Whether a training at the new psi accepted an object's step; a rejected step is undone.
 
     ``expected_gain`` is the fall of L_val that the hypergradient predicts to first order, ``measured_gain`` the rise of
     the object's score, ``error`` the standard error of that rise over validation images and trainings.
@@ -43,7 +43,7 @@ class Proposal:
     Attributes:
         psi: the proposed psi; for an object that should stay, its present one.
         p_values: p-values, by object, of the null hypothesis that the present psi is right.
-        images: number of images that were composed for it.
+        images: number of images that the proposal took.
         shown: the estimate from the target's boxes on which psi is based.
     """
 
@@ -65,7 +65,7 @@ class LearnedObjects:
 class Steps(Protocol):
     """Present psi [objects, K] of the learned objects, and the evidence for the next step.
 
-    Immutable: ``judge``, ``observe`` and ``propose``, called in this order, each return a new state.
+    It is immutable: ``judge``, ``observe`` and ``propose``, called in this order, each return a new state.
     """
 
     @property
@@ -80,7 +80,7 @@ class Steps(Protocol):
 
     @property
     def waiting(self) -> Collection[tuple[str, str]]:
-        """Pairs of object and factor that the last step did not move, although the certificate allowed it."""
+        """Pairs of object and factor that the last step did not move."""
         ...
 
     def judge(
@@ -88,19 +88,19 @@ class Steps(Protocol):
     ) -> tuple[Self, dict[str, Verdict]]:
         """Accept or reject the pending step by the scores of trainings ``before`` and ``after`` it.
 
-        They are each validation image's contributions to the score of each class; higher is better.
+        The scores are each validation image's contributions to the score of each class; higher is better.
         """
         ...
 
     def observe(self, result: Hypergradient) -> tuple[Self, PValues]:
         """Add a derivative at ``reported``.
 
-        The p-values test the null hypothesis that the derivative that steps follow is zero.
+        The p-values test the null hypothesis that the derivative along which steps go is zero.
         """
         ...
 
     def propose(self, certificate: Certificate, shrink: float) -> Self:
-        """Take the next step; a shrunk step is taken by the fraction ``shrink``."""
+        """Take the next step; of a shrunk step, only the fraction ``shrink`` is taken."""
         ...
 
 
@@ -112,7 +112,7 @@ class FreeSteps:
     Args:
         update: optimiser of the bins' logits.
         light_update: optimiser of the weights of lights, which are then projected onto their constraint.
-        final_step: fraction to which steps shorten linearly over the iterations (Robbins and Monro 1951).
+        final_step: factor on the last step; on earlier ones, it falls linearly from 1 (Robbins and Monro 1951).
     """
 
     trainings: ClassVar[int] = 1
@@ -173,7 +173,7 @@ class GradientSteps:
         return self, {}
 
     def observe(self, result: Hypergradient) -> tuple[GradientSteps, PValues]:
-        """Follow the last derivative alone; see ``Steps``."""
+        """Keep only the last derivative; see ``Steps``."""
         gradient, error = stacked(result, self.objects.names, self.reported)
         return replace(self, gradient=gradient, error=error), result.p_values
 
@@ -198,7 +198,7 @@ class GradientSteps:
         return replace(self, reported=reported, updates=updates, taken=self.taken + 1)
 
     def _step(self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor) -> tuple[Tensor, UpdateState]:
-        """Step along one factor: in logits for bins, in weights for lights, projected onto their constraint."""
+        """Step along one factor, in logits of bins or weights of lights, and project the result onto its constraint."""
         update: Update = getattr(self.settings, factor.update)
         state = self.updates[factor.name]
         moved, state = update.step(psi, factor.log_slopes(psi), slope, noise, state)
@@ -206,7 +206,7 @@ class GradientSteps:
 
 
 def fractions(certificate: Certificate, names: Sequence[str], factor: str, shrink: float) -> list[float]:
-    """Return the fraction of each object's step by a factor that is taken; ``shrink`` applies to shrunk steps."""
+    """Return the fraction of each object's step along a factor that is taken; ``shrink`` for shrunk steps."""
     taken = {"kept": 1.0, "shrunk": shrink, "skipped": 0.0, "stopped": 0.0}
     return [taken[certificate.actions[name][factor]] for name in names]
 
@@ -219,12 +219,12 @@ def slopes_by_p(
 ) -> tuple[Float[Tensor, "objects k"], Float[Tensor, "objects k"]]:
     """Convert the derivative of L_val by psi to the derivative of minus L_val by a factor's p, centred.
 
-    The derivative by logits is (p - floor) times the one by p, so that it would hardly move a bin of small p. ``error``
-    has the standard errors of ``gradient``; the second result has the variances of the first.
+    The derivative by logits is (p - floor) times the one by p (up to a constant), so that steps along it would hardly
+    move a bin of small p. ``error`` has the standard errors of ``gradient``; the second result has the variances of the
+    first.
     """
-    scale = (
-        factor.log_slopes(psi).exp().clamp_min(torch.finfo(psi.dtype).tiny)
-    )  # 0 in closed bins, where the slope is 0
+    # log_slopes are -inf in closed bins, where the gradient is 0.
+    scale = factor.log_slopes(psi).exp().clamp_min(torch.finfo(psi.dtype).tiny)
     direction = -gradient / scale
     return direction - direction.mean(-1, keepdim=True), (error / scale).square()
 
@@ -232,7 +232,7 @@ def slopes_by_p(
 def stacked(
     result: Hypergradient, names: Sequence[str], like: Tensor
 ) -> tuple[Float[Tensor, "objects K"], Float[Tensor, "objects K"]]:
-    """Stack the named objects' derivatives, and their standard errors."""
+    """Stack the named objects' derivatives, and their standard errors, as rows."""
     both = (result.gradients, result.errors)
     gradient, error = (torch.stack([values[name] for name in names]).to(like) for values in both)
     return gradient, error

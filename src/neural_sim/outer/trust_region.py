@@ -5,14 +5,14 @@ parameters, batches, backgrounds and noise of the draws), so that the difference
 the step with little noise. A step is accepted if its derivative and this difference are significant together, because
 either alone often is not, and if the score did not fall by more than its error. The radius grows after a step that
 raised the object's score by more than the error, and shrinks after one that lowered it by more than the error or was
-rejected (Conn, Gould and Toint 2000, Chapter 6, with the reduction measured object by object). It shrinks less in the
-last case: the noise of a training does not shrink with the step, so that chance would decide even more about a much
-shorter step.
+rejected (Conn, Gould and Toint 2000, Chapter 6, with the reduction measured object by object). It shrinks less after a
+step that was rejected without such a fall: the noise of a training does not shrink with the step, so that chance would
+decide even more about a much shorter step.
 
-A step goes to the distribution nearest to p + t direction, with t chosen so that its distance from p is the radius;
-bins of equal value gain equally. (Along logits, a bin gains in proportion to its p, and likely bins take nearly
-everything.) A bin keeps a fraction of its p: because the score is concave in the number of a bin's images, the
-derivative, which is linear, says little about having none.
+A step goes to the distribution nearest to p + t direction, with t chosen so that its distance from p is the radius.
+Bins with equal derivatives gain equally. (Along logits, a bin gains in proportion to its p, and likely bins take nearly
+everything.) A bin keeps a fraction of its p: the score is concave in the number of a bin's images, so the derivative
+says little about having none.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ from neural_sim.outer.steps import LearnedObjects, Proposal, PValues, Verdict, f
 from neural_sim.parameter.factor import Factor
 from neural_sim.ranges import Fraction, NonNegative, Positive, PositiveInt, validated
 
-SMALLEST = 1e-15  # smallest p-value, with normal quantile -8
+SMALLEST = 1e-15  # smallest p-value, which is about 8 standard deviations
 HALVINGS = 50
-# Largest t in p + t direction, whose largest component is 1: bins that differ by a thousandth are told apart.
+# Largest t in p + t direction, for a direction whose largest component is 1: derivatives of bins that differ by a
+# thousandth of that still count.
 FARTHEST = 1e3
 
 ByFactor = Mapping[str, Float[Tensor, "objects"]]
@@ -50,20 +51,20 @@ class TrustRegion:
 
     Args:
         trainings: number of trainings in the first iteration, whose derivatives are averaged. Two show how much
-            trainings scatter; after one, the test only knows the scatter over images.
-        folds: number of disjoint parts of the validation images. Each derivative is of L_val on one of them, so that
-            the scatter between derivatives includes the choice of validation images.
+            trainings scatter; with one, the test knows only the scatter over images.
+        folds: number of disjoint parts of the validation images. Each derivative is that of L_val on one of them, so
+            that the scatter between derivatives includes that of the choice of validation images.
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
             the weights).
         largest: upper bound of the radius.
         smallest: an object with a smaller radius does not move.
-        keep: fraction of its p that a step leaves to each bin; 0: no bound. The score is concave in a bin's images.
+        keep: smallest fraction of its p that a step leaves to each bin; 0: no bound.
         level: significance level at which a step is accepted, by its derivative and its measured gain together.
         errors: number of standard errors by which an object's score must rise for its radius to grow, and fall for it
             to shrink by the whole factor.
-        waits_below: an object does not move by a factor if its expected gain is below this fraction of the iteration's
-            largest one: it waits until the large steps are done. Its derivative was measured with the other objects'
-            psi still wrong, and changes once they have moved.
+        waits_below: an object does not move along a factor if the expected gain is below this fraction of the
+            iteration's largest one: it waits until the large steps are done. Its derivative was measured with the other
+            objects' psi still wrong, and changes once they have moved.
         take_back: whether at the end every object goes back to the best psi that it has had, judged by all trainings
             that saw it (``outer.way``); otherwise the last psi is the result.
         grow: factor on the radius after an accepted step that raised the score.
@@ -97,7 +98,7 @@ class TrustRegion:
     def begin(
         self, objects: LearnedObjects, psi: Float[Tensor, "objects K"], iterations: int
     ) -> TrustRegionSteps:
-        """Start at ``psi`` before the first iteration, whatever the number of ``iterations``."""
+        """Start at ``psi``, before the first iteration; ``iterations`` makes no difference."""
         psi, parts = psi.detach().clone(), objects.distribution.split(psi)
         averages = {name: Average.zeros(part, self.momentum) for name, part in parts.items()}
         nothing = torch.zeros_like(psi[:, 0])
@@ -126,14 +127,14 @@ class TrustRegionSteps:
         trial: psi with the pending step.
         radius: trust radii, by factor.
         averages: the averaged derivatives that steps have followed, by factor.
-        observed: these averages with the derivatives since the last step added.
+        observed: these averages, with the derivatives since the last step.
         moved: whether the pending step moved an object, by factor.
         expected: expected gain of the pending step.
-        significance: significance, in standard deviations, of the derivatives or the proposal by which the pending step
-            moved an object.
-        at_rest: for each judgement, the variance between trainings: the mean squared gain of the objects that did not
-            move, less the error over images.
-        offered: objects that the pending step moved to a proposal, which leaves their radii as they are.
+        significance: significance, in standard deviations, of the derivatives or the proposal that moved an object in
+            the pending step.
+        at_rest: the variance between trainings in each judgement: the mean squared gain of the objects that did not
+            move, less the squared error over images.
+        offered: the objects that the pending step moved to a proposal, which does not change their radii.
     """
 
     settings: TrustRegion
@@ -151,7 +152,7 @@ class TrustRegionSteps:
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
-        """Psi with the pending step, which its expected gain supports until a training has judged it."""
+        """Psi with the pending step, which counts as taken until a training rejects it."""
         return self.trial
 
     @property
@@ -161,7 +162,7 @@ class TrustRegionSteps:
 
     @property
     def waiting(self) -> set[tuple[str, str]]:
-        """Pairs of object and factor whose radius is too small, or whose gain is small compared with the largest."""
+        """Pairs of object and factor that the last step did not move, for example because of ``waits_below``."""
         return {
             (name, factor)
             for factor, moved in self.moved.items()
@@ -171,7 +172,7 @@ class TrustRegionSteps:
 
     @property
     def _pending(self) -> Bool[Tensor, "objects"]:
-        """Objects that moved, by any factor, and whose step is neither accepted nor rejected yet."""
+        """The objects that moved along any factor, and whose step is neither accepted nor rejected yet."""
         moved = torch.stack([*self.moved.values()]).any(0)
         return moved if self.offered is None else moved | self.offered
 
@@ -188,7 +189,7 @@ class TrustRegionSteps:
         )
 
     def held(self, names: Collection[str]) -> TrustRegionSteps:
-        """Keep some objects where they are from now on."""
+        """Keep the named objects where they are from now on."""
         held = torch.tensor([name in names for name in self.objects.names])
         radius = {factor: values.masked_fill(held, 0.0) for factor, values in self.radius.items()}
         return replace(self, radius=radius)
@@ -200,15 +201,15 @@ class TrustRegionSteps:
 
         A step is accepted if its derivative and the measured gain are significant together at ``level``, by the sum of
         their normal quantiles divided by the root of 2 (Stouffer et al. 1949), and if the score did not fall by more
-        than ``errors``: a derivative may differ from zero with certainty and yet promise next to nothing. The gain's
-        error combines the images' paired differences with the scatter between trainings, which the scores of objects
-        that did not move show. If all steps would be accepted but the mean over all classes fell by more than its own
-        error, all are rejected.
+        than ``errors`` standard errors: a derivative may certainly differ from zero and yet promise next to nothing.
+        The gain's error combines that over images, from paired differences, with the scatter between trainings, which
+        the scores of objects that did not move show. If all steps would be accepted, but the sum over all classes fell
+        by more than ``errors`` of its own standard errors, all are rejected.
         """
         settings, labels, pending = self.settings, torch.tensor(self.objects.labels), self._pending
         change = after.double() - before.double()
         gains, images = change.sum(1), _errors_of_sums(change)
-        # Computed before at_rest is extended: the harm that this step does to others is not scatter between trainings.
+        # Computed before at_rest is extended: harm that this step does to other objects is not scatter of trainings.
         total_error = (
             _errors_of_sums(change.nansum(0)).square() + len(gains) * _between_trainings(self.at_rest)
         ).sqrt()
@@ -273,7 +274,7 @@ class TrustRegionSteps:
         return replace(self, observed=observed), p_values
 
     def propose(self, certificate: Certificate, shrink: float) -> TrustRegionSteps:
-        """Step along the averages by the radii; see ``outer.steps.Steps``."""
+        """Step along the averages, as far as the radii; see ``outer.steps.Steps``."""
         if certificate.void:
             nothing = torch.zeros_like(self.expected)
             return replace(self, observed=self.averages, trial=self.accepted, expected=nothing)
@@ -341,7 +342,7 @@ def step_within(
 def _between_trainings(at_rest: tuple[float, ...]) -> float:
     """Return the variance of a gain between trainings.
 
-    It is the median over judgements, because a large step of one object can really change the scores of those at rest.
+    It is the median over judgements, because a large step of one object can also change the scores of objects at rest.
     """
     return max(median(at_rest), 0.0) if at_rest else 0.0
 
@@ -349,7 +350,7 @@ def _between_trainings(at_rest: tuple[float, ...]) -> float:
 def _significance(
     averages: Mapping[str, Average], moved: Mapping[str, Bool[Tensor, "objects"]]
 ) -> Float[Tensor, "objects"]:
-    """Return the significance of the derivatives by the factors that move, in standard deviations.
+    """Return each object's significance, in standard deviations, of the derivatives along which it moves.
 
     If several factors move, the most significant one counts, with its p-value times their number (Bonferroni).
     """

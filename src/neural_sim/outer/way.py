@@ -1,14 +1,14 @@
-"""The sequence of psi that each object has had, and the choice of the one that a loop returns.
+"""The sequence of psi that each object has had, its way, and the choice of the one that a loop returns.
 
-Scores scatter between trainings, and a single pair of trainings judges a step: a slightly harmful step may be accepted,
-and harm that shows only over later trainings goes unnoticed. At the end, every accepted psi is therefore scored again
-by all the trainings that saw it. The largest of several noisy means is too often a lucky one; so the values m_v of an
+Scores scatter between trainings, and only one pair of trainings judges a step: a slightly harmful step may be accepted,
+and harm that shows only in later trainings goes unnoticed. At the end, every psi on the way is therefore judged by all
+the trainings that used it. The largest of several noisy means is too often a lucky one, so the values m_v of an
 object's psi are fitted to the scores y_t of its trainings, assuming that successive psi have similar values:
 
     minimise over m    sum_t (y_t - m_v(t))^2 + w sum_v f(m_v - m_(v-1)),    f(x) = c^2 log(1 + x^2 / c^2)
 
-This m is the most probable one if scores have normal errors with standard deviation s between trainings, and steps
-change them by about s / sqrt(w), a few by much more (Student's t). c is three times s.
+This m is the most probable one if scores have normal errors, with standard deviation s between trainings, and steps
+change the values by about s / sqrt(w), a few by much more (Student's t). c is three times s.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 WEIGHT = 4.0
-"""w, for steps that mostly change a score by half of its scatter. On simulated ways (tests/outer/test_way.py)
-1 takes too many good steps back and 8 too few bad ones."""
+"""w, for steps that mostly change a score by half of its scatter. In simulations (tests/outer/test_way.py), 1 takes
+back too many good steps, and 8 too few bad ones."""
 LARGE = 3.0
-"""c in units of s: a larger change of score between neighbours is not held back."""
+"""c in units of s: larger changes of score between neighbours are hardly smoothed."""
 REPETITIONS = 50
 
 
@@ -36,7 +36,7 @@ class Stay:
 
     Attributes:
         psi: the object's psi.
-        scores: the object's score in every training that saw this psi; higher is better.
+        scores: the object's score in every training at this psi; higher is better.
     """
 
     psi: Float[Tensor, "K"]
@@ -48,8 +48,8 @@ class TakenBack:
     """An object that goes back to an earlier psi at the end.
 
     Attributes:
-        kept: number of its accepted steps that are kept; 0: it goes back to the initial psi.
-        accepted: number of all its accepted steps.
+        kept: number of its accepted steps that it keeps; 0: it goes back to the initial psi.
+        accepted: number of its accepted steps.
         gain: estimated gain in score of the returned psi over the last one.
     """
 
@@ -74,11 +74,11 @@ class Way:
         return self._with(name, (*self.stays[name], Stay(psi.clone())))
 
     def settled(self, names: Collection[str]) -> Way:
-        """Forget where some objects were before, so that they cannot go back there."""
+        """Forget where the named objects were before, so that they cannot go back there."""
         return Way({name: stays[-1:] if name in names else stays for name, stays in self.stays.items()})
 
     def seen(self, name: str, score: float) -> Way:
-        """Add the score of a training that saw an object at its present psi."""
+        """Add an object's score in a training at its present psi."""
         *before, here = self.stays[name]
         return self._with(name, (*before, replace(here, scores=(*here.scores, score))))
 
@@ -98,9 +98,9 @@ class Way:
         return squares / freedom if freedom else None
 
     def best(self) -> dict[str, tuple[Stay, TakenBack]]:
-        """Return the objects whose best psi is not their last one, and what is taken back.
+        """Return, for each object whose best psi is not its last one, that psi and what is taken back.
 
-        The result is empty if no psi was trained on twice: the scatter of trainings is then unknown.
+        The result is empty if no psi was trained on twice, because the scatter of trainings is then unknown.
         """
         found, variance = {}, self.variance
         for name, stays in self.stays.items():
@@ -120,7 +120,7 @@ def fitted_scores(
     """Estimate the score of each psi on an object's way, by iteratively reweighted least squares.
 
     Args:
-        scores: scores of the trainings that saw each psi; at least one for every psi.
+        scores: scores of the trainings at each psi; at least one for every psi.
         variance: s^2, the variance of a score between trainings.
         weight: w, the number of trainings that a neighbour on the way is worth.
 
