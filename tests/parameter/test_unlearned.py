@@ -25,7 +25,7 @@ def test_radii_are_asked_for_in_metres_alone():
 
 def test_objects_of_unknown_size_or_too_large_are_named():
     distribution = SceneDistribution.of([Pose()], METRES)
-    with pytest.raises(ValueError, match=r"nothing says that of mug: set objects\.size"):
+    with pytest.raises(ValueError, match=r"nothing gives the size of mug: set objects\.size"):
         distribution.radii({"can": 0.1, "mug": None})
     with pytest.raises(ValueError, match=r"0\.4 m from mug, of radius 0\.39 m.* more than 0\.41 m"):
         distribution.radii({"can": 0.1, "mug": 0.39})

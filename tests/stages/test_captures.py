@@ -108,7 +108,7 @@ def test_metres_want_a_size(root, tmp_path):
     context, _ = started(root, tmp_path, *metres, "objects.size=0.2")
     assert context.graph.radii == (0.1, 0.1)
     context, _ = started(root, tmp_path, *metres, "objects.size={can: 0.2}")
-    with pytest.raises(ValueError, match=r"nothing says that of mug: set objects\.size"):
+    with pytest.raises(ValueError, match=r"nothing gives the size of mug: set objects\.size"):
         _ = context.graph.radii
 
 

@@ -119,7 +119,7 @@ def test_what_a_subject_has_not_is_refused_by_its_name():
     with pytest.raises(ValueError, match="a: its mesh has one fixed light"):
         MeshSubject("a", None, None).maps(CAMERA, torch.eye(4)[None], torch.ones(1, 3))
     metres = SceneDistribution.of([Pose(bins=4)], Unlearned(distance=(0.5, 0.7), distance_unit="metres"))
-    with pytest.raises(ValueError, match="nothing says that of a, b"):
+    with pytest.raises(ValueError, match="nothing gives the size of a, b"):
         dataclasses.replace(scene(), distribution=metres)
 
 

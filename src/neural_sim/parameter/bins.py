@@ -1,6 +1,6 @@
 """A categorical distribution over bins and its Gumbel-softmax relaxation (paper, Sec. 3.1, Tool 1).
 
-Everything is a pure function of the logits psi and of noise drawn beforehand, so that a draw can be replayed.
+Every draw is a pure function of the logits psi and of noise drawn beforehand, so it can be replayed.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from torch import Tensor
 
 from neural_sim.parameter.distributions import project_simplex
 
-# Softmax of the lowest logit that ``bounded`` allows, as a fraction of the floor; p there exceeds the floor by at most
-# that fraction.
+# Smallest softmax of a bin, relative to the largest bin's, that ``bounded`` allows, in units of the floor. There, p
+# exceeds the floor by at most this fraction of it.
 LOWEST = 0.25
-# Logit of a bin from which nothing may be drawn, such as one that no photograph of the object shows. Its p is 0,
-# without a floor, and no step brings it back. It is far below what steps can reach, so that no low logit is mistaken
-# for it, and yet small enough to keep the digits of the other logits in a mean.
+# Logit of a closed bin, from which nothing may be drawn, such as one that no photograph of the object shows. Its p is
+# 0, without a floor, and no step reopens it. Steps never reach so low a logit, so it cannot be mistaken for an open
+# bin's, and yet a sum that contains it keeps enough digits of the other logits.
 CLOSED = -1e9
 
 
@@ -27,15 +27,15 @@ CLOSED = -1e9
 class BinNoise:
     """Noise that selects the bins of n draws.
 
-    ``offset``: uniform in [0, 1), for exact draws that are balanced over the bins, see ``balanced``; None: independent
-    draws.
+    With an ``offset``, uniform in [0, 1), exact draws are balanced over the bins (see ``balanced``); without it, they
+    are independent.
     """
 
     gumbel: Float[Tensor, "n k"]
     offset: float | None = None
 
     def select(self, index: Int[Tensor, "m"]) -> BinNoise:
-        """Select the draws ``index``, which may repeat. The result is not balanced: only all draws together are."""
+        """Select draws by index, repeats allowed. The offset is dropped: only all n draws together are balanced."""
         return BinNoise(self.gumbel[index])
 
 
@@ -52,11 +52,11 @@ def closing(psi: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"]) -> Float[T
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Compute log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
 
-    The floor keeps every bin within reach of a draw and every log p finite, whatever psi is. Closed bins have no floor;
-    k counts only the open ones.
+    The floor lets every open bin be drawn and keeps its log p finite, whatever psi is. Closed bins have no floor, and k
+    counts only the open ones.
 
     Raises:
-        ValueError: unless 0 <= floor < 1 / k.
+        ValueError: unless 0 <= floor < 1 / (number of all bins).
     """
     bins = psi.shape[-1]
     if not 0.0 <= floor < 1.0 / bins:
@@ -72,8 +72,8 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Compute log w for w = p - ``floor``, without cancellation.
 
-    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)). With p instead of w, the derivatives of bins at
-    the floor would vanish.
+    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)); divided by w, it is the derivative by p, up to a
+    constant. Divided by p instead, it would vanish for bins at the floor.
     """
     closed = is_closed(psi)
     if not bool(closed.any()):
@@ -84,8 +84,8 @@ def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, 
 def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Raise logits that lie further below the largest than log(1 / (``LOWEST`` ``floor``)).
 
-    At that logit a bin's p is within a quarter of the floor. Further down p hardly changes, and a few steps could not
-    bring the bin back.
+    At that logit, p exceeds the floor by at most a quarter. Further down, p hardly changes, and a few steps could not
+    bring the bin back. Closed bins stay closed.
     """
     if floor == 0.0:
         return psi
@@ -99,10 +99,10 @@ def nearest(
     least: Float[Tensor, "*n k"] | float = 0.0,
     closed: Bool[Tensor, "*n k"] | None = None,
 ) -> Float[Tensor, "*n k"]:
-    """Find the nearest probabilities (Euclidean) that are not below ``least``, whose sum must be less than 1.
+    """Find the probabilities that are nearest to ``values`` (Euclidean) and not below a bound.
 
-    Nor are they below the p of a logit that ``bounded`` has raised, with the largest p taken as 1. Those of ``closed``
-    bins are 0.
+    The bound is ``least``, whose sum must be less than 1, or the p of a logit that ``bounded`` has raised (with the
+    largest softmax taken as 1), whichever is larger. ``closed`` bins get 0.
     """
     bins = values.shape[-1]
     lowest = (torch.zeros_like(values) + least).clamp_min(floor + LOWEST * floor * (1.0 - bins * floor))
@@ -121,7 +121,7 @@ def logits(
 ) -> Float[Tensor, "*n k"]:
     """Compute centred logits of ``probabilities``, clamped to just above the floor; see ``log_probabilities``.
 
-    The probability of ``closed`` bins goes to the others, in proportion.
+    The probability of ``closed`` bins is shared among the others in proportion to theirs.
     """
     if closed is not None and bool(closed.any()):
         open_ = (~closed).sum(-1, keepdim=True)
@@ -144,13 +144,13 @@ def gumbel(shape: tuple[int, ...], generator: torch.Generator, dtype: torch.dtyp
 def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: float) -> Int[Tensor, "n"]:
     """Draw n bins, each of which follows p, with bin b drawn n p_b times, rounded down or up.
 
-    The counts are those of systematic sampling: of the numbers ``offset``, ``offset`` + 1, ... below n (``offset``
-    uniform in [0, 1)), those that fall into the bin's part of the cumulated n p. The draws start as the Gumbel-max
-    ones; from bins with too many, those that lose least change to bins with too few. Most draws therefore stay when p
-    moves under the same noise.
+    The counts are those of systematic sampling: a bin is drawn once for each of the points ``offset``, ``offset`` + 1,
+    ... below n (``offset`` uniform in [0, 1)) in its interval of the cumulative sum of n p. The draws start as those of
+    the Gumbel-max trick. Draws then move from bins that have too many to bins that have too few, first those whose
+    log p plus noise falls least. Most draws therefore keep their bins when p changes under the same noise.
 
     Raises:
-        ValueError: log p is NaN, so that bins would never have enough draws.
+        ValueError: log p contains NaN.
     """
     count, k = gumbel.shape
     p = log_p.double().softmax(-1)
@@ -174,7 +174,7 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
 def gumbel_softmax(
     log_p: Float[Tensor, "... k"], noise: Float[Tensor, "*n k"], temperature: float
 ) -> Float[Tensor, "*n k"]:
-    """Compute y of Eq. 4: softmax((G + log p) / tau). Its largest component follows p for every tau > 0.
+    """Compute y of Eq. 4: softmax((G + log p) / tau). The index of its largest component follows p for every tau > 0.
 
     Raises:
         ValueError: unless the temperature is positive.
@@ -191,17 +191,18 @@ def centres(bins: int, low: float, high: float, like: Tensor) -> Float[Tensor, "
 
 
 def linear_mean(weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"]) -> Float[Tensor, "*n"]:
-    """Compute the paper's approximate bin centre, sum_i y_i B_i. On a circle, it is wrong where angles wrap around."""
+    """Compute the paper's approximate bin centre, sum_i y_i B_i, which is wrong where angles wrap around."""
     return weights @ bin_centres
 
 
 def circular_mean(
     weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"], smallest_resultant: float = 0.1
 ) -> Float[Tensor, "*n"]:
-    """Compute the direction of sum_i y_i exp(i B_i), in [0, 2 pi): equivariant under shifts of the bins.
+    """Compute the direction, in [0, 2 pi), of the sum of the unit vectors at angles B_k, weighted by y_k.
 
-    Its derivative grows as one over the resultant's length, without bound if opposite bins mix in equal parts. The
-    derivative therefore uses at least ``smallest_resultant`` as the length. The value is exact.
+    It is equivariant under shifts of the bins. Its derivative is proportional to one over the length of that resultant,
+    without bound if opposite bins mix in equal parts, so the derivative takes the length as at least
+    ``smallest_resultant``. The value is exact.
     """
     sine, cosine = weights @ bin_centres.sin(), weights @ bin_centres.cos()
     squared = (sine.square() + cosine.square()).detach().clamp_min(smallest_resultant**2)

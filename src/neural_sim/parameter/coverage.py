@@ -16,7 +16,7 @@ from neural_sim.parameter.factor import COORDINATES
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 
 STEPS = 5
-"""Number of poses along each angle of a bin at which photographs are looked for."""
+"""Number of poses along each angle of a bin that are compared with the photographs."""
 LEAST = 0.5
 """Smallest fraction of a bin's poses that must be near a photograph for the bin to count as covered."""
 
@@ -30,22 +30,22 @@ class Coverage:
 
     @property
     def covered(self) -> tuple[bool, ...]:
-        """Whether photographs show most of each bin."""
+        """For each bin, whether at least the fraction ``LEAST`` of its poses is near a photograph."""
         return tuple(fraction >= LEAST for fraction in self.fractions)
 
     @property
     def missing(self) -> list[int]:
-        """The bins, numbered from 1, that photographs do not show."""
+        """The bins, numbered from 1, that are not covered."""
         return [number + 1 for number, covered in enumerate(self.covered) if not covered]
 
 
 def coverage(
     distribution: SceneDistribution, factor: str, directions: Float[Tensor, "photos 3"], within_deg: float
 ) -> Coverage | None:
-    """Compute how far photographs cover a factor's bins; None if its bins are not directions.
+    """Compute how much of each bin of a factor photographs cover; None if its bins are not directions.
 
     Args:
-        distribution: the distribution of poses; coordinates that the factor does not draw cover their whole range.
+        distribution: the distribution of poses; the angle that the factor does not draw covers its whole range.
         factor: name of the factor.
         directions: unit vectors from the object to the photographs' cameras, in the object's frame.
         within_deg: largest angle in degrees at which a photograph is near a pose.
@@ -61,7 +61,7 @@ def coverage(
     fractions: list[float] = []
     for number in range(own.bins):
         bins = {
-            # Together, the bins of another angle make up its range, which ``second`` runs through.
+            # As ``second`` goes from 0 to 1, the other factors run through all of their bins.
             f.name: torch.full((len(first),), number) if f is own else (second * f.bins).long()
             for f in distribution.binned
         }
@@ -80,7 +80,7 @@ def coverage(
 def coverages(
     distribution: SceneDistribution, directions: Mapping[str, Float[np.ndarray, "_ 3"]], within_deg: float
 ) -> dict[str, dict[str, Coverage]]:
-    """Compute ``coverage`` by object and factor, for all factors that have one."""
+    """Compute ``coverage`` by object and factor, for all factors whose bins are directions."""
     found: dict[str, dict[str, Coverage]] = {}
     for name, seen in directions.items():
         every = {

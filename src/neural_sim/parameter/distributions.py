@@ -1,4 +1,4 @@
-"""Distributions over bins: named in the configuration, projections onto them, and distances between them."""
+"""Distributions over bins: those that the configuration names, their distance, and projections onto the simplex."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torch import Tensor
 
 Specification = str | Mapping[str, object] | Sequence[float]
 Biased = Mapping[str, Mapping[Literal["initial", "target"], Specification]]
-"""Named distributions of some objects, by object."""
+"""Initial and target distributions of single objects, by object name."""
 
 DOMINANT_REST = 0.02
-"""Probability of a bin that is not a mode. The paper (Sec. 4.2) only names the dominant bins; the number comes from its
-authors' code and leaves 0.86 for one mode of eight bins, 0.44 for each of two and 0.3 for each of three
-(github.com/gyhandy/Neural-Sim-NeRF, optimization/neural_sim_main.py)."""
+"""Probability of a bin that is not a mode, for up to 25 bins. The paper (Sec. 4.2) only names the dominant bins; the
+number comes from its authors' code and leaves 0.86 for one mode of eight bins, 0.44 for each of two and 0.3 for each of
+three (github.com/gyhandy/Neural-Sim-NeRF, optimization/neural_sim_main.py)."""
 
 
 def distribution(specification: Specification, bins: int, where: str = "distribution") -> Float[Tensor, "k"]:
     """Compute the probabilities of ``bins`` bins, float64, from a specification in the configuration.
 
     A specification is ``uniform``; ``{dominant: b}``, 0.02 on all bins except b, which has the rest (0.86 for k = 8);
-    ``{modes: [b, ...]}``, 0.02 on all others, the rest split equally among the modes; or ``bins`` numbers
-    that add up to 1. Bins are numbered from 1, as in the paper.
+    ``{modes: [b, ...]}``, 0.02 on all other bins, the rest split equally among the modes; or ``bins`` numbers that add
+    up to 1. With more than 25 bins, 0.02 is replaced by 1 / (2 k). Bins are numbered from 1, as in the paper.
 
     Raises:
-        ValueError: an unknown name, a bin outside 1..bins, or numbers that are negative or do not add up to 1.
-            The message begins with ``where``.
+        ValueError: an unknown form, a bin outside 1..bins, a repeated mode, or numbers that are too few or too many,
+            negative or not finite, or that do not add up to 1. The message begins with ``where``.
     """
     if specification == "uniform":
         return torch.full((bins,), 1.0 / bins, dtype=torch.float64)
@@ -74,12 +74,12 @@ def merged(p: Float[Tensor, "*n k"], groups: Sequence[Sequence[int]]) -> Float[T
 
 
 def total_variation(p: Float[Tensor, "*n k"], q: Float[Tensor, "*n k"]) -> Float[Tensor, "*n"]:
-    """Compute the total variation, half the L1 distance of two distributions: 0 if equal, 1 if disjoint."""
+    """Compute the total variation distance, half the L1 distance: 0 if p equals q, 1 if they are disjoint."""
     return 0.5 * (p - q).abs().sum(-1)
 
 
 def project_sum(values: Float[Tensor, "*n k"], total: float = 1.0) -> Float[Tensor, "*n k"]:
-    """Project onto the plane ``sum(w) = total``, whose points may have either sign.
+    """Project onto the hyperplane ``sum(w) = total``; weights may have either sign.
 
     Raises:
         ValueError: there are no entries, or some are not finite.
@@ -91,10 +91,11 @@ def project_sum(values: Float[Tensor, "*n k"], total: float = 1.0) -> Float[Tens
 def project_simplex(values: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
     """Project onto the simplex ``w >= 0, sum(w) = 1`` (Held, Wolfe and Crowder 1974).
 
-    The nearest point is ``max(v - t, 0)`` for the one t at which it adds up to 1. Only differences to the largest
-    entry matter, and only those below 1 (t lies at most 1 below the largest entry), so that nothing large is ever
-    subtracted: entries of any size are projected to within a few roundings of 1. The projection is differentiable where
-    the set of positive weights does not change: there the derivative is ``I - 1 1^T / (positive weights)`` on that set.
+    The nearest point is ``max(v - t, 0)`` for the one t at which it adds up to 1. As t lies at most 1 below the largest
+    entry, only entries less than 1 below it matter, and only their differences from it. Nothing large is subtracted, so
+    the result adds up to 1 within a few rounding errors, whatever the size of the entries. The projection is
+    differentiable where the set of positive weights does not change: there the derivative is ``I - 1 1^T / m`` on that
+    set of m weights.
 
     Raises:
         ValueError: there are no entries, or some are not finite.

@@ -1,4 +1,4 @@
-"""Factors of p_psi: the interface that all of them share, and log p over equal bins of one scene parameter."""
+"""Factors of p_psi: the interface that all of them share, and the factor with bins of one coordinate."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from neural_sim.types import SceneDraw
 
 Coordinate = Literal["phi", "rho", "distance", "magnification"]
 COORDINATES: tuple[Coordinate, ...] = get_args(Coordinate)
-"""The numbers of a ``SceneDraw`` on which images depend smoothly."""
+"""The numbers of a ``SceneDraw`` that place the camera and set its focal length; images depend smoothly on them."""
 Gap = Literal["disjoint", "uniform", "same"]
 Floor = Annotated[float, Ge(0), Lt(1)]
-"""Smallest probability of a bin; must be below 1 over their number."""
+"""Smallest probability of a bin; must be less than 1 / (number of bins)."""
 
 
 @validated
 @dataclass(frozen=True)
 class ConfiguredDistributions:
-    """Initial and target distribution of one factor for each object, as configured.
+    """Initial and target distributions of one factor for each object, as configured.
 
     Args:
         initial, target: the distributions of objects that are not named in ``biased``.
         biased: object name -> {initial: ..., target: ...}, see ``distributions.distribution``.
-        gap: how far biased objects start from their target: ``disjoint``, as ``biased`` says; ``uniform``; or ``same``,
-            at the target itself.
-        closed: object name -> its bins, from 1, from which nothing is drawn, whatever the distributions say.
+        gap: where biased objects start: ``disjoint``, at the initial distribution in ``biased``; ``uniform``; or
+            ``same``, at their target.
+        closed: object name -> numbers, from 1, of its bins from which nothing is drawn, whatever the distributions say.
     """
 
     initial: Specification = "uniform"
@@ -63,7 +63,7 @@ class ConfiguredDistributions:
 
 
 class Factor(Protocol):
-    """One factor of p_psi with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).
+    """One factor of p_psi, with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).
 
     ``update`` names the setting of the psi loop that chooses its optimiser.
     """
@@ -95,7 +95,7 @@ class Factor(Protocol):
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """The settings that hard draws at a given ``p`` depend on."""
+        """The settings on which hard draws at given probabilities depend."""
         ...
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
@@ -117,7 +117,7 @@ class Factor(Protocol):
         ...
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Compute log w such that a derivative by psi, divided by w, is that by p up to a constant; 0 for lights."""
+        """Compute log w: a derivative by psi, divided by w, is the derivative by p up to a constant; 0 for lights."""
         ...
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -127,7 +127,7 @@ class Factor(Protocol):
     def moved(
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
-        """Find the psi whose p is nearest to p + ``change``, such that each bin keeps at least ``keep`` of its p."""
+        """Find the psi whose p is nearest to p + ``change`` while each bin keeps at least a fraction ``keep`` of p."""
         ...
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
@@ -138,13 +138,13 @@ class Factor(Protocol):
 @validated
 @dataclass(frozen=True)
 class BinnedFactor:
-    """psi are the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
+    """A factor whose part of psi has the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
 
     Args:
         name: name of the factor, and of the configuration node ``parameter.<name>``.
-        coordinate: the scene's coordinate that is drawn; angles in radians, lengths in object radii.
-        geometric: bins of equal ratio instead of equal width (both ends positive).
-        periodic: ``low`` and ``high`` are the same place.
+        coordinate: the coordinate that is drawn; angles are in radians, distances in the distribution's unit.
+        geometric: bins have equal ratios of their ends instead of equal widths; ``low`` must be positive.
+        periodic: ``low`` and ``high`` are the same angle.
         temperature: tau of the Gumbel-softmax (Eq. 4; the paper: 0.1).
         bin_mean: ``linear`` is the paper's sum_i y_i B_i, ``circular`` its counterpart on the circle.
         floor: smallest probability of a bin.
@@ -176,14 +176,17 @@ class BinnedFactor:
                 f"{where}.floor: want less than 1/{self.bins} for {self.bins} bins, got {self.floor}"
             )
         if not self.low < self.high or (self.geometric and not self.low > 0.0):
-            raise ValueError(f"{where}: want an ordered range of its bins, got [{self.low}, {self.high}]")
+            both = " and both positive" if self.geometric else ""
+            raise ValueError(
+                f"{where}: want a range of bins with low < high{both}, got [{self.low}, {self.high}]"
+            )
         for name in (*(self.configured.biased or {}), ""):  # "": objects that are not named
             for which in ("initial", "target"):
                 self.probabilities(which, name)
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """The settings that draws at given probabilities depend on, without relaxation and logits."""
+        """The settings on which hard draws at given probabilities depend: neither relaxation nor floor."""
         names = ("coordinate", "bins", "low", "high", "geometric", "periodic")
         return {name: getattr(self, name) for name in names}
 
@@ -203,7 +206,7 @@ class BinnedFactor:
         return distribution(self.configured.of(which, object_name), self.bins, where)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """Compute the logits that give ``probabilities``, except for closed bins."""
+        """Compute the logits of ``probabilities``, with nothing on closed bins."""
         return self.psi_of(self.probabilities(which, object_name), self.closed(object_name))
 
     def closed(self, object_name: str) -> Bool[Tensor, "k"]:
@@ -222,7 +225,7 @@ class BinnedFactor:
         return self.log_probabilities(psi).exp()
 
     def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Compute log p over the bins, floored."""
+        """Compute log p of the bins, with the floor."""
         return binned.log_probabilities(psi, self.floor)
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -230,7 +233,7 @@ class BinnedFactor:
         return binned.log_slopes(psi, self.floor)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Raise logits that lie too far below the largest, see ``bounded``."""
+        """Raise logits that lie too far below the largest, see ``bins.bounded``."""
         return binned.bounded(psi, self.floor)
 
     def moved(
@@ -238,7 +241,7 @@ class BinnedFactor:
     ) -> Float[Tensor, "*n k"]:
         """Compute logits of the probabilities nearest to p + ``change``.
 
-        None is lower than ``project`` allows, or lower than the fraction ``keep`` of its present value.
+        No probability is lower than ``project`` allows, or than the fraction ``keep`` of its present value.
         """
         p, closed = self.p_of(psi), binned.is_closed(psi)
         return binned.logits(binned.nearest(p + change, self.floor, keep * p, closed), self.floor, closed)
@@ -261,9 +264,10 @@ class BinnedFactor:
     def relaxed(
         self, psi: Float[Tensor, "k"], noise: BinNoise, within: Float[Tensor, "n"]
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Draw the coordinate differentiably in psi (approximate bin centre plus uniform offset, Tool 1), and the bins.
+        """Draw the coordinate differentiably in psi (approximate bin centre plus uniform offset, Tool 1).
 
-        At small tau nearly all of the derivative comes from the few draws near a tie between two bins.
+        Also returns the bins of the hard draws under the same noise. At small tau, nearly all of the derivative comes
+        from the few draws near a tie between two bins.
         """
         log_p = self.log_probabilities(psi)
         weights = binned.gumbel_softmax(log_p, noise.gumbel, self.temperature)

@@ -1,7 +1,7 @@
-"""The illumination parameter: psi are affine weights of anchor lights, deterministic and constrained.
+"""The illumination parameter: psi are deterministic weights of anchor lights that add up to 1.
 
-A light's code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.2), so that an object's images share one
-light, and psi takes projected gradient steps. Estimators that need a density draw a Gaussian around psi instead, and
+An object's images share one light, whose code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.2), and psi
+takes projected gradient steps. Estimators that need a density draw the weights from a Gaussian around psi instead, and
 score the draw before its projection, because the projected draw has no density.
 """
 
@@ -33,7 +33,7 @@ Constraint = Literal["simplex", "affine"]
 
 @dataclass(frozen=True)
 class GaussianDraw:
-    """Draws around psi: ``log_prob`` scores ``unprojected``; ``weights`` are projected, and rendered."""
+    """Draws around psi: ``log_prob`` scores ``unprojected``; ``weights``, their projections, are rendered."""
 
     unprojected: Float[Tensor, "n k"]
     weights: Float[Tensor, "n k"]
@@ -42,11 +42,11 @@ class GaussianDraw:
 @validated
 @dataclass(frozen=True)
 class Illumination:
-    """Weights over ``anchors`` lights.
+    """Weights of ``anchors`` lights, configured for each object.
 
     Args:
         anchors: k, the number of anchor lights.
-        constraint: ``simplex``: no weight below 0; ``affine``: any that add up to 1.
+        constraint: ``simplex``: weights add up to 1 and none is below 0; ``affine``: they add up to 1.
         deviation: standard deviation of each weight in Gaussian draws.
         initial, target: weights of objects that are not named in ``biased``: ``uniform``, ``{dominant: b}``,
             ``{modes: [b, ...]}`` (see ``distributions.distribution``) or k numbers that add up to 1.
@@ -77,7 +77,7 @@ class Illumination:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """The settings that images at given weights depend on."""
+        """The settings on which images at given weights depend."""
         return {"anchors": self.anchors}
 
     @property
@@ -87,17 +87,17 @@ class Illumination:
 
     @property
     def lights(self) -> int:
-        """The anchor lights that psi weighs."""
+        """Number of anchor lights."""
         return self.anchors
 
     @property
     def factors(self) -> tuple[Illumination, ...]:
-        """Itself, the only factor."""
+        """This parameter, which is its own only factor."""
         return (self,)
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Empty: nothing else is drawn here."""
+        """Empty: an illumination draws no coordinates."""
         return {}
 
     @property
@@ -121,7 +121,7 @@ class Illumination:
     def psi_of(
         self, p: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"] | None = None
     ) -> Float[Tensor, "*n k"]:
-        """Return ``p``: psi consists of the weights themselves."""
+        """Return ``p``, because psi consists of the weights themselves."""
         return p
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -129,7 +129,7 @@ class Illumination:
         return psi
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Return 0, because derivatives by psi are those by the weights."""
+        """Return 0, because derivatives by psi are derivatives by the weights."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -143,9 +143,9 @@ class Illumination:
     def moved(
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
-        """Find the nearest weights to psi + ``change`` that meet the constraint.
+        """Find the weights nearest to psi + ``change`` that meet the constraint.
 
-        ``keep`` is for bins and ignored here: a weight does not count images.
+        ``keep`` is ignored: it stops bins from losing their images, but weights are not shares of images.
         """
         return self.project(psi + change)
 
@@ -156,7 +156,7 @@ class Illumination:
             ValueError: the draws are under the fixed light.
         """
         if draw.weights is None:
-            raise ValueError("parameter.illumination: want draws under weighed lights, got the fixed one")
+            raise ValueError("parameter.illumination: want draws under weighted lights, got the fixed light")
         return draw.weights.argmax(-1)
 
     def draw(self, psi: Float[Tensor, "k"], count: int) -> Float[Tensor, "n k"]:
@@ -164,7 +164,7 @@ class Illumination:
         return psi.expand(count, -1)
 
     def explore(self, psi: Float[Tensor, "k"], noise: Float[Tensor, "n k"]) -> GaussianDraw:
-        """Draw from N(psi, deviation^2 I) with standard normal ``noise``, and project the draws; detached from psi."""
+        """Draw from N(psi, deviation^2 I) by standard normal ``noise``, and project; detached from psi."""
         unprojected = psi.detach() + self.deviation * noise
         return GaussianDraw(unprojected, self.project(unprojected))
 

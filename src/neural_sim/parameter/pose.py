@@ -15,7 +15,7 @@ from neural_sim.ranges import Ascending, Matching, Positive, PositiveInt, valida
 
 Axis = Literal["polar", "azimuth", "both"]
 OTHER_RANGE_DEG: Mapping[Axis, tuple[float, float]] = {"azimuth": (45.0, 135.0), "both": (-45.0, 45.0)}
-"""Range of the angle that is not learned, if ``unlearned`` does not give it."""
+"""Default of ``other_range_deg`` by axis; with ``polar``, rho has the range of ``unlearned`` instead."""
 Range = Annotated[
     tuple[float, float], Ascending(), Matching(lambda ends: ends[1] - ends[0] <= 360.0, "at most a circle")
 ]
@@ -28,17 +28,19 @@ class Pose:
 
     Args:
         bins: k, the number of equal bins of the full circle.
-        axis: ``polar`` bins phi, the great circle through the poles, with rho uniform in ``other_range_deg``;
-            ``azimuth`` bins rho, the turn about the vertical, with phi uniform in ``other_range_deg``; ``both`` bins
-                phi's full circle and rho's ``other_range_deg`` (``other_bins`` of them, which do not wrap), as two
-                factors ``pose`` and ``turn``. If both angles go round the full circle (the paper's rho), (phi, rho) and
-                (360 - phi, rho + 180) are the same place and direction, with the camera upside down in one of them:
-                bins i and k + 1 - i show an object from the same sides, upright and upside down.
-        other_range_deg: null: for rho ``unlearned.rho_deg``, or [-45, 45] with ``both``; for phi [45, 135].
+        axis: ``polar`` bins phi, the angle along the great circle through the poles, with rho uniform in
+            ``other_range_deg``; ``azimuth`` bins rho, the turn about the vertical, with phi uniform in
+            ``other_range_deg``; ``both`` bins phi's full circle and rho's ``other_range_deg``, as two factors ``pose``
+            and ``turn``. If both angles cover the full circle (as the paper's rho does), (phi, rho) and
+            (360 - phi, rho + 180) are the same camera position and direction, with the camera upside down in one of
+            them: bins i and k + 1 - i show an object from the same sides, upright and upside down.
+        other_bins: number of rho's bins with ``both``; they do not wrap.
+        other_range_deg: range of the angle that ``bins`` does not divide. null: for rho, ``unlearned.rho_deg``, or
+            [-45, 45] with ``both``; for phi, [45, 135].
         temperature, bin_mean, floor: see ``BinnedFactor``; ``bin_mean`` applies to the full circle.
-        uncovered: what to do with bins that are not near any photograph of the object: ``leave_out`` (their p is 0) or
+        uncovered: what to do with bins that photographs of the object do not cover: ``leave_out`` (their p is 0) or
             ``render``.
-        covered_within_deg: largest angle between a pose and the direction of a photograph that is near it.
+        covered_within_deg: a photograph is near a pose if their directions differ by at most this angle.
         initial, target, biased, gap: see ``ConfiguredDistributions``. With ``both``, {phi: ..., rho: ...} gives each
             angle a distribution; a single distribution applies to phi, and rho is uniform.
 
@@ -69,7 +71,7 @@ class Pose:
 
     @property
     def factors(self) -> tuple[BinnedFactor, ...]:
-        """The learned angles."""
+        """One factor for each learned angle."""
         configured = ConfiguredDistributions(self.initial, self.target, self.biased, self.gap)
         circle = BinnedFactor(
             "pose", "rho" if self.axis == "azimuth" else "phi", self.bins, 0.0, 2.0 * math.pi, periodic=True,

@@ -22,7 +22,7 @@ from neural_sim.types import SceneDraw
 
 
 class Parameter(Protocol):
-    """A configured parameter: the factors that it learns, and uniform ranges of coordinates that it draws unlearned."""
+    """A configured parameter: its factors, and the ranges of coordinates that it draws uniformly."""
 
     @property
     def factors(self) -> tuple[Factor, ...]:
@@ -40,7 +40,7 @@ class Covered(Protocol):
 
     @property
     def missing(self) -> list[int]:
-        """The bins, numbered from 1, that photographs do not show."""
+        """The bins, numbered from 1, that are not covered."""
         ...
 
 
@@ -61,7 +61,7 @@ class SceneNoise:
         return len(self.uniform["phi"])
 
     def select(self, index: Int[Tensor, "k"]) -> SceneNoise:
-        """Select the draws ``index``, which may repeat."""
+        """Select draws by index, repeats allowed."""
         bins = {name: part.select(index) for name, part in self.bins.items()}
         uniform = {name: values[index] for name, values in self.uniform.items()}
         return SceneNoise(bins, uniform, None if self.light is None else self.light[index])
@@ -86,7 +86,7 @@ class SceneDistribution:
         drawn = [factor.coordinate for factor in self.binned]
         if not names or len(set(names)) < len(names) or len(set(drawn)) < len(drawn):
             raise ValueError(
-                f"parameter: want one or more factors of different names and coordinates, got {names} of {drawn}"
+                f"parameter: want at least one factor, and different names and coordinates, got {names} and {drawn}"
             )
 
     @staticmethod
@@ -104,7 +104,7 @@ class SceneDistribution:
         )
 
     def radii(self, sizes: Mapping[str, float | None]) -> tuple[float, ...] | None:
-        """Return the radii of ``sizes`` if distances are in metres, see ``radii_in_metres``; otherwise None."""
+        """Return the objects' radii if distances are in metres, see ``radii_in_metres``; otherwise None."""
         if self.distance_unit == "radii":
             return None
         nearest = next((f.low for f in self.binned if f.coordinate == "distance"), self.ranges["distance"][0])
@@ -130,7 +130,7 @@ class SceneDistribution:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """The settings that hard draws at given probabilities depend on, without relaxation and logits."""
+        """The settings on which hard draws at given probabilities depend: neither relaxation nor floor."""
         drawn = {"factors": [factor.drawn for factor in self.factors], "ranges": dict(self.ranges)}
         return drawn | {"distance_unit": self.distance_unit}
 
@@ -147,7 +147,7 @@ class SceneDistribution:
         return sum(factor.size for factor in self.factors)
 
     def split(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n _"]]:
-        """Split psi, or any vector of psi's shape, into every factor's part."""
+        """Split psi, or any vector of psi's shape, into the factors' parts."""
         parts = torch.split(psi, [factor.size for factor in self.factors], -1)
         return dict(zip(self.names, parts, strict=True))
 
@@ -162,7 +162,7 @@ class SceneDistribution:
         )
 
     def leaving_out(self, covered: Mapping[str, Mapping[str, Covered]]) -> SceneDistribution:
-        """Return the distribution with p = 0 in the bins that are not covered, by object and factor.
+        """Return this distribution with p = 0 in the bins that are not ``covered``, by object and factor.
 
         Raises:
             ValueError: an object has no bin left.
@@ -184,7 +184,7 @@ class SceneDistribution:
         return replace(self, factors=tuple(factors))
 
     def uniform_of(self, objects: Sequence[str]) -> Float[Tensor, "objects K"]:
-        """Compute the psi at which every object has uniform open bins and equal weights of lights."""
+        """Compute the psi of uniform open bins and equal weights of lights, for each object."""
         even = [(f, distribution("uniform", f.size)) for f in self.factors]
         return torch.stack([torch.cat([f.psi_of(p, f.closed(name)) for f, p in even]) for name in objects])
 
@@ -194,7 +194,7 @@ class SceneDistribution:
         return torch.cat([f.psi_of(distribution("uniform", f.size)) for f in self.factors])
 
     def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n _"]]:
-        """Compute every factor's probabilities of its bins, and the weights of the lights."""
+        """Compute the probabilities of every factor's bins, and the weights of the lights."""
         parts = self.split(psi)
         return {f.name: f.p_of(parts[f.name]) for f in self.factors}
 
@@ -236,7 +236,7 @@ class SceneDistribution:
             generator: the source of all random numbers.
             dtype: dtype of the noise.
             explore: whether to draw lights around psi's, for estimators that need a density.
-            balanced: whether exact draws fill every factor's bins n p times, rounded.
+            balanced: whether exact draws fall into each bin of a factor n p times, rounded down or up.
         """
         gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype) for f in self.binned}
         learned = {f.coordinate for f in self.binned}
@@ -301,7 +301,7 @@ class SceneDistribution:
     def stratum(
         self, name: str, bins: Int[Tensor, "n"], psi: Float[Tensor, "K"], noise: SceneNoise
     ) -> SceneDraw:
-        """Draw samples in given bins of one factor, with all others from p_psi."""
+        """Draw samples in given bins of one factor, with the bins of the others drawn from p_psi."""
         parts = self.split(psi)
         others = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned if f.name != name}
         return self.lit(self.at_bins({**others, name: bins}, noise), psi.detach())
@@ -316,15 +316,15 @@ class SceneDistribution:
         logs = [f.log_probabilities(parts[f.name])[draw.bins[:, i]] for i, f in enumerate(self.binned)]
         if self._light is not None:
             if draw.explored is None:
-                raise ValueError("parameter.illumination: these lights were not drawn, they have no density")
+                raise ValueError("parameter.illumination: lights that were not drawn have no density")
             logs.append(self._light.log_prob(parts[self._light.name], draw.explored))
         return torch.stack(logs).sum(0)
 
     def statistics(self, draw: SceneDraw) -> dict[str, Num[Tensor, "n _"]]:
         """Compute sufficient statistics of each factor's psi.
 
-        They are the drawn bin, one-hot, or the drawn light before its projection, centred. A light that was not drawn
-        has none.
+        For bins they are the drawn bin as a one-hot vector; for lights, the drawn weights before their projection,
+        centred. Lights that were not drawn around psi have none.
         """
         statistics = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(self.binned)}
         if self._light is not None and draw.explored is not None:
@@ -361,7 +361,7 @@ class SceneDistribution:
 class RelaxedDraws:
     """Draws that depend smoothly on psi, for the pathwise estimator.
 
-    ``tangents``: also render the derivatives of maps by the coordinates of a draw that depend on psi.
+    ``tangents``: also render the images' derivatives by those coordinates of a draw that depend on psi.
     """
 
     tangents: bool = False
@@ -375,9 +375,9 @@ class RelaxedDraws:
 
 @dataclass(frozen=True)
 class HardDraws:
-    """Exact samples of p_psi, balanced over the bins.
+    """Exact samples of p_psi, by default balanced over the bins.
 
-    ``explore``: independent samples, and lights around psi's, for estimators that need the draws' joint density.
+    ``explore``: draw independent samples, and lights around psi's, for estimators that need the draws' joint density.
     """
 
     explore: bool = False

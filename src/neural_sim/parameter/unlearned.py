@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 from neural_sim.ranges import Ascending, Positive, validated
 
 Unit = Literal["radii", "metres"]
-"""Each object's own radius, or metres, which need objects of known size."""
+"""Radii of each object, or metres, which need objects of known size."""
 NEAREST = 1.05
-"""In object radii: any closer, a camera is inside the object."""
+"""Smallest distance, in object radii, at which a camera is safely outside the object."""
 
 
 @validated
@@ -35,28 +35,30 @@ class Unlearned:
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Ranges by coordinate, in radians and in the unit of distances."""
+        """Ranges by coordinate, in radians and in ``distance_unit``."""
         phi, rho = ((math.radians(r[0]), math.radians(r[1])) for r in (self.phi_deg, self.rho_deg))
         return {"phi": phi, "rho": rho, "distance": self.distance, "magnification": (1.0, 1.0)}
 
 
 def radii_in_metres(nearest: float, sizes: Mapping[str, float | None]) -> tuple[float, ...]:
-    """Return the radii in metres of the objects ``sizes``, and check that cameras ``nearest`` metres away are outside.
+    """Return the objects' radii in metres; check that cameras ``nearest`` metres away are outside the objects.
+
+    ``sizes`` has the radius of each object, None where it is unknown.
 
     Raises:
-        ValueError: an object has an unknown size, or the nearest camera would be inside it.
+        ValueError: an object has an unknown size, or the nearest camera would not be safely outside it.
     """
     unknown = [name for name, radius in sizes.items() if radius is None]
     if unknown:
         raise ValueError(
-            f"distances in metres need objects of known size, and nothing says that of {', '.join(unknown)}: "
+            f"distances in metres need objects of known size, but nothing gives the size of {', '.join(unknown)}: "
             "set objects.size, or give distances in object radii"
         )
     known = {name: radius for name, radius in sizes.items() if radius is not None}
     for name, radius in known.items():
         if not nearest > NEAREST * radius:
             raise ValueError(
-                f"distances: a camera {nearest:g} m from {name}, of radius {radius:.3g} m, is inside it; want more "
-                f"than {NEAREST * radius:.3g} m"
+                f"distances: a camera {nearest:g} m from {name}, of radius {radius:.3g} m, is inside it or too close; "
+                f"want more than {NEAREST * radius:.3g} m"
             )
     return tuple(known.values())

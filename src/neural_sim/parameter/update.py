@@ -1,7 +1,7 @@
-"""Steps of psi along a hypergradient, bounded so that one noisy gradient cannot collapse p.
+"""Optimisers of psi, whose steps can be bounded so that one noisy hypergradient cannot collapse p.
 
-For bins, psi are logits and ``log_p`` [objects, k] is the factor's ``log_slopes``, log p without the floor; steps are
-in logits. For lights, psi are weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the
+For bins, psi are logits and ``log_p`` [objects, k] is the factor's ``log_slopes``, log (p - floor); steps are in
+logits. For lights, psi are weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the
 factor's ``project`` returns the result to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient``
 and ``standard_error`` have psi's shape, in units of the outer loss over those of psi.
 """
@@ -23,14 +23,16 @@ _log = logging.getLogger(__name__)
 
 Momentum = Annotated[float, Ge(0), Lt(1)]
 CLIP = 10.0
-"""The mirror step clips a gradient whose root mean square exceeds the largest so far by more than this factor."""
+"""``Mirror`` scales down a direction whose root mean square exceeds the largest average's so far by this factor."""
 
 
 @dataclass(frozen=True)
 class UpdateState:
-    """State of an update between steps: two moments of the direction, its noise variance, and the number of steps.
+    """State of an optimiser between steps.
 
-    ``refused`` counts gradients that are not finite, or whose squares are not: they change neither psi nor the moments.
+    ``first`` is the momentum. For ``Mirror``, ``second`` is the largest mean square of its average so far, and
+    ``noise`` the variance of ``first``. ``steps`` counts the steps that were taken, ``refused`` those that were refused
+    because the gradient or the result was not finite; these change neither psi nor the momentum.
     """
 
     first: Float[Tensor, "objects k"]
@@ -62,12 +64,12 @@ def _accept(
 ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
     """Take a step, or refuse it if the result is not finite: a NaN would stay in the moments.
 
-    An infinite noise variance (an unknown standard error) keeps the old variance for the same reason.
+    Where the noise variance is not finite (an unknown standard error), the old one is kept for the same reason.
     """
     if all(bool(torch.isfinite(values).all()) for values in (moved, first, second)):
         noise = torch.where(torch.isfinite(noise), noise, before.noise)
         return moved, UpdateState(first, second, noise, before.steps + 1, before.refused)
-    _log.warning("psi: refused a step, because its gradient is not finite")
+    _log.warning("psi: refused a step because its gradient is not finite")
     return psi, replace(before, refused=before.refused + 1)
 
 
@@ -76,7 +78,7 @@ def _accept(
 class SGD:
     """Gradient descent with momentum (the paper: rate 1e-5 on its own loss scale, momentum 0.9).
 
-    ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``; with ``max_step`` None steps are not bounded, as
+    ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``. If ``max_step`` is None, steps are not bounded, as
     in the paper.
     """
 
@@ -99,14 +101,14 @@ class SGD:
 class Mirror:
     """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
 
-    In logits, the direction is the gradient by p (the gradient by the logits divided by p), centred: a bin of small p
-    takes as long a step as one of large p. Momentum averages the direction. The average is divided by the largest root
-    mean square over all objects and bins so far, so that ``learning_rate`` is in logits per step whatever the units of
-    the loss, and steps shorten with the gradient. (A scale that decays would amplify the small gradients near the end,
-    and objects without a gradient would drift.)
+    In logits, the direction is the gradient by p (the gradient by the logits divided by p - floor), centred: a bin of
+    small p takes as long a step as one of large p. Momentum averages the direction. The average is divided by the
+    largest value so far of its root mean square over all objects and bins, so that ``learning_rate`` is in logits per
+    step whatever the units of the loss, and steps shorten with the gradient. (A scale that decays would amplify the
+    small gradients near the end, and objects without a gradient would drift.)
 
     With ``shrink``, each component of the average is multiplied by ``shrinkage`` (James and Stein 1961, positive part):
-    components within their noise do not move. Standard errors that are not finite shrink nothing.
+    components within their noise do not move. A component whose standard error is not finite is not shrunk.
     """
 
     learning_rate: Positive = 3.0
@@ -135,7 +137,7 @@ class Mirror:
         return _accept(psi, moved, state, velocity, largest, noise)
 
     def _clipped(self, direction: Float[Tensor, "objects k"], state: UpdateState) -> Float[Tensor, ""]:
-        """Compute the factor that clips an outlier to ``CLIP`` times the scale, which never decreases."""
+        """Compute the factor that scales an outlier down to ``CLIP`` times the scale, which never decreases."""
         size, known = direction.square().mean().sqrt(), state.second.max().sqrt()
         return torch.where(
             known > 0.0, (CLIP * known / size.maximum(known)).clamp_max(1.0), torch.ones_like(size)

@@ -17,10 +17,10 @@ By = Literal["distance", "focal_length"]
 @validated
 @dataclass(frozen=True)
 class Zoom:
-    """``bins`` bins of equal ratio, which do not wrap: neighbouring centres differ in image size by (far / near)^(1/k).
+    """A zoom in bins of equal ratio, which do not wrap: image sizes of neighbours have the ratio (far / near)^(1/k).
 
     Args:
-        bins: k.
+        bins: k, the number of bins.
         by: ``distance`` moves the camera; ``focal_length`` magnifies the image from where the camera stands, without
             changing the perspective.
         range: nearest and farthest distance; or smallest and largest focal length in units of the camera's own. Bin 1
@@ -66,5 +66,5 @@ class Zoom:
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Empty: nothing else is drawn here."""
+        """Empty: a zoom draws no other coordinates."""
         return {}
