@@ -69,7 +69,7 @@ REFUSED = {
         lambda a, b: (
             (a == "renderer=nerf_w" or "illumination" in a) and b.startswith("field=") and b not in LIT
         ),
-        "renderer=nerf_w wants fields with appearance codes",
+        "renderer=nerf_w needs a field with appearance codes",
     ),
     "going on": (
         lambda a, b: a == "outer.start=previous" and (b in REWARDED or b == "outer/steps=trust_region"),

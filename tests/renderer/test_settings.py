@@ -17,7 +17,7 @@ CASES = [
     (LightRig, {"temperature_range": (9000.0, 2700.0)}, "LightRig.temperature_range: want values that do not decrease"),
     (LightRig, {"intensity_range": (0.0, 0.9)}, "LightRig.intensity_range[0]: want more than 0"),
     (LightRig, {"fill": 1.5}, "LightRig.fill: want at least 0 and at most 1, got 1.5"),
-    (LightRig, {"ambient": 0.3}, "LightRig.ambient: want at most 1 with the largest intensity, 0.9, or white"),
+    (LightRig, {"ambient": 0.3}, "LightRig.ambient: want at most 1 together with the largest intensity, 0.9"),
     (VariedLight, {"anchored": 0.0}, "VariedLight.anchored: want more than 0 and at most 1"),
     (VariedLight, {"mixtures": 0}, "VariedLight.mixtures: want at least 1"),
     (Light, {"direction": (0.0, 0.0, 0.0), "intensity": 1.0}, "Light.direction: want three numbers, not all of"),

@@ -1,1 +1,1 @@
-"""Camera to image and opacity: mesh rasteriser, ray caster, radiance field."""
+"""Render images with opacity from cameras: mesh rasteriser, ray caster and radiance fields."""

@@ -1,4 +1,4 @@
-"""Directional lights fixed in the object's frame, shading by Lambert's law, and the colours of temperatures."""
+"""Directional lights fixed in the object's frame, shading by Lambert's law, and the colours of black bodies."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ LOBES = (
     ((0.821, 568.8, 46.9, 40.5), (0.286, 530.9, 16.3, 31.1)),
     ((1.217, 437.0, 11.8, 36.0), (0.681, 459.0, 26.0, 13.8)),
 )
-"""The CIE 1931 observer's x, y, z as sums of (height, centre, width below, width above) in nm (Wyman et al. 2013)."""
+"""The CIE 1931 observer's x, y and z, each a sum of lobes: height, then centre, width below and width above the centre
+in nm (Wyman et al. 2013)."""
 
 
 @validated
 @dataclass(frozen=True)
 class Light:
-    """A directional light. ``direction`` points towards it, in the world frame, and may have any length but zero.
+    """A directional light. ``direction`` points towards it, in the object's frame, with any length but zero.
 
     ``colour`` is sRGB and multiplies ``intensity``; a negative intensity removes light (as in affine mixtures).
     ``fill`` is the fraction that arrives from all sides, as if scattered by the walls of a room.
@@ -45,9 +46,9 @@ class Light:
 @validated
 @dataclass(frozen=True)
 class Lighting:
-    """A white surface has the colour ``ambient`` plus the contributions of ``lights``.
+    """Ambient and directional light: a white surface has the colour ``ambient`` plus the contributions of ``lights``.
 
-    This is linear in the lights' intensities as long as nothing leaves [0, 1]. Colours are sRGB values; gamma is
+    The colour is linear in the lights' intensities as long as nothing leaves [0, 1]. Colours are sRGB values; gamma is
     ignored.
     """
 
@@ -56,7 +57,7 @@ class Lighting:
 
 
 def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.ndarray, "n 3"]:
-    """Return the factor on the albedo for unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
+    """Return the factor on the albedo at unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
     shade = np.full((len(normals), 3), lighting.ambient)
     for light in lighting.lights:
         towards = np.asarray(light.direction, dtype=np.float64)
@@ -69,7 +70,8 @@ def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.n
 def temperature_colour(kelvin: float) -> Vector:
     """Return the sRGB colour (gamma encoded, largest channel 1) of a black body, by Planck's law and CIE 1931.
 
-    Raises ``ValueError`` outside ``Kelvin``'s range.
+    Raises:
+        ValueError: ``kelvin`` is outside the range of ``Kelvin``.
     """
     check(kelvin, Kelvin, "temperature_colour.kelvin")
     wavelength = np.arange(360.0, 831.0, 5.0)

@@ -1,4 +1,4 @@
-"""Render meshes offscreen by OpenGL with pyrender, which this module imports; ``views`` chooses the renderer."""
+"""Render meshes offscreen by OpenGL with pyrender, which no other module imports; ``views`` chooses the renderer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ with contextlib.suppress(ImportError):
     # loaded second, it crashes the process; if it is loaded first, both work.
     import triton  # noqa: F401
 
-# Nothing closer to the camera than this is drawn; objects have radius 1, and cameras stay outside them.
+# Only what lies between these distances from the camera is drawn; objects have radius 1, and cameras stay outside them.
 NEAR, FAR = 0.01, 100.0
 WRAPS = {"repeat": GLTF.REPEAT, "mirror": GLTF.MIRRORED_REPEAT, "clamp": GLTF.CLAMP_TO_EDGE}
 
@@ -56,9 +56,9 @@ class PyrenderRenderer(MeshRenderer):
 
 
 def _primitives(surface: Surface) -> pyrender.Mesh:
-    """Build the front faces of each texture, and the same faces reversed with the light on their inner side.
+    """Build the front faces of each texture, and the same faces reversed, with the light on their inner side.
 
-    Faces are culled if they face away, so that exactly one of the two is seen and they never overlap in depth.
+    Faces that face away are culled, so that exactly one of the two is seen and they never overlap in depth.
     """
     sides = []
     for page in np.unique(surface.page).tolist():

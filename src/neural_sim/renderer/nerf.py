@@ -1,4 +1,4 @@
-"""Render images of a radiance field, and their derivatives with respect to the rays."""
+"""Render images of a radiance field, and their derivatives by the camera or the rays."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ QUALITIES: dict[Quality, Omissions] = {
 class NerfRenderer:
     """Renders whole views at once, or any bundle of rays with derivatives.
 
-    The choice of samples depends on the rays alone, so that a replay is identical, and values and derivatives at one
-    quality belong to the same function.
+    Samples depend on the field and the rays alone, so a replay is identical, and values and derivatives at one quality
+    belong to the same function.
 
     Args:
         quality: the approximations; conf/renderer/nerf.yaml has the measured error of each.
@@ -76,7 +76,7 @@ class NerfRenderer:
         """Raise ``ValueError`` for a kind of field that this renderer cannot draw."""
 
     def at(self, quality: Quality) -> Self:
-        """Return this renderer at another quality.
+        """Return this renderer at another quality, without overrides of the quality's approximations.
 
         Raises:
             ValueError: an unknown quality.
@@ -111,7 +111,7 @@ class NerfRenderer:
     ]:
         """Render like ``render``, with the depth along the view axis in object radii.
 
-        The depth is where a pixel's ray has lost half of its light; it is 0 at opacities below 1/2, where no ray does.
+        The depth is where a pixel's ray has lost half of its light; it is 0 if the ray loses less (opacity below 1/2).
         """
         image = render_views(
             field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
@@ -127,10 +127,11 @@ class NerfRenderer:
         camera_to_world: Float[Tensor, "views 4 4"],
         rates: Float[Tensor, "m views 4 4"],
     ) -> tuple[Maps, list[Maps]]:
-        """Render like ``render``, with m derivatives for cameras that move at ``rates`` (then those of a moving light).
+        """Render like ``render``, with m derivatives for cameras that move at ``rates``.
 
-        Ray directions keep unit length whatever the rates, so that the rates may include that of a focal length.
-        One pass computes both; beyond the maps, it takes the memory of ``rays_per_chunk`` rays.
+        Derivatives by a moving light follow, if the field has one. Ray directions keep unit length whatever the rates,
+        so that the rates may include that of a focal length. One pass computes values and derivatives; beyond the maps,
+        it takes the memory of ``rays_per_chunk`` rays.
         """
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)
         value = camera_to_world.new_zeros(shape)
@@ -150,7 +151,10 @@ class NerfRenderer:
         """Render premultiplied colour and opacity of rays (rays, 3); zero where a ray misses.
 
         Differentiable in origins and directions, in reverse and forward mode; the sample distances are constants,
-        chosen without noise. Raises ValueError for rays of another shape.
+        chosen without noise.
+
+        Raises:
+            ValueError: rays of another shape.
         """
         if (
             rays.origins.ndim != 2

@@ -20,7 +20,7 @@ class NerfWRenderer(NerfRenderer):
     """A ``NerfRenderer`` whose views have weights over the field's anchors, normally adding up to 1.
 
     A view's code is ``weights @ field.anchors`` (paper, Sec. 3.2). Views of equal weights are rendered as one batch
-    under one code. Opacity does not depend on the weights. Without weights the anchors count equally.
+    under one code. Opacity does not depend on the weights. Without weights, all anchors have the same weight.
     """
 
     @override
@@ -28,7 +28,7 @@ class NerfWRenderer(NerfRenderer):
     def check(kind: type[RadianceField]) -> None:
         if not issubclass(kind, AppearanceField):
             raise ValueError(
-                f"renderer=nerf_w wants fields with appearance codes: want field=grid_w, got {kind.__name__}"
+                f"renderer=nerf_w needs a field with appearance codes: want field=grid_w, got {kind.__name__}"
             )
 
     @torch.no_grad()
@@ -84,7 +84,8 @@ class NerfWRenderer(NerfRenderer):
     ) -> tuple[Maps, list[Maps]]:
         """Render like ``render``, with m derivatives for moving cameras, then q for changing weights.
 
-        The rates are ``rates`` and ``weight_rates``; m or q may be 0. Derivatives of opacity by weights are exactly 0.
+        Cameras move at ``rates`` and weights change at ``weight_rates``; m or q may be 0. Derivatives of opacity by
+        weights are exactly 0.
         """
         field, weights = _checked(field, weights, len(camera_to_world))
         if weight_rates is None:
@@ -144,7 +145,7 @@ def _checked(
 def _groups(
     rows: Float[Tensor, "views c"], device: torch.device
 ) -> Iterator[tuple[Float[Tensor, "c"], Int[Tensor, "some"]]]:
-    """Return the distinct rows and the views of each, on ``device``; rows are compared on the CPU."""
+    """Yield each distinct row and its views, on ``device``; rows are compared on the CPU."""
     different, number = rows.cpu().unique(dim=0, return_inverse=True)
     for place, row in enumerate(different.to(device)):
         yield row, (number == place).nonzero()[:, 0].to(device)

@@ -1,7 +1,7 @@
-"""Correct the camera poses of photographs until the photographs agree on one field of the object.
+"""Correct the camera poses of photographs so that the photographs agree on one field of the object.
 
-Each round fits a small field at the present poses and moves each camera by Gauss-Newton steps towards agreement of its
-photograph with that field: image alignment as in Lucas and Kanade (1981), against a radiance field. BARF (Lin et al.
+Each round fits a small field at the current poses, then moves each camera by Gauss-Newton steps so that renders of the
+field match its photograph: image alignment as in Lucas and Kanade (1981), against a radiance field. BARF (Lin et al.
 2021) moves field and poses with a single optimiser instead.
 """
 
@@ -34,8 +34,8 @@ from neural_sim.types import Maps, PosedViews
 _log = logging.getLogger(__name__)
 
 FAIR = 0.1
-"""Scale of Fair's robust loss (1974), in units of colour and opacity. Larger differences, such as from highlights and
-passers-by, count by their size, smaller ones by their square."""
+"""Scale of Fair's robust loss (1974), in units of colour and opacity. Differences far above it, such as those from
+highlights and passers-by, count in proportion to their size, those far below it in proportion to their square."""
 DAMPING = 1e-3
 """Damping of the normal equations, relative to their diagonal (Marquardt 1963)."""
 VIEWS_AT_ONCE = 16
@@ -44,19 +44,19 @@ VIEWS_AT_ONCE = 16
 @validated
 @dataclass(frozen=True)
 class PoseRefinement:
-    """Corrects poses in rounds, each with a small field and steps of each camera.
+    """Corrects poses in rounds: each fits a small field, then moves the cameras by Gauss-Newton steps.
 
-    Coarse fields correct cameras that are far off, but also shift correct ones; in the last third of the rounds, fields
-    have twice the resolution and steps, and move those back.
+    Coarse fields correct cameras that are far off, but also shift correct ones. Fields of the last third of the rounds
+    have twice the resolution and twice the optimiser steps, and move those back.
 
     Args:
         rounds: number of times a field is fitted; 0: the given poses are kept.
-        updates: Gauss-Newton steps of each camera in a round.
+        updates: number of Gauss-Newton steps of each camera in a round.
         image_size: longer side in pixels to which larger views are reduced.
-        resolution: cells along the unit sphere's diameter in the fields of the first rounds.
-        steps: optimiser steps for each of these fields.
-        batch_rays: number of rays in a step.
-        seed: seed of the order of rays; separate from the run's seed, so that runs share views.
+        resolution: number of cells along the unit sphere's diameter in the fields of the earlier rounds.
+        steps: number of optimiser steps for each of these fields.
+        batch_rays: number of rays in an optimiser step.
+        seed: seed of the order of rays; separate from the run's seed, so that runs share the corrected views.
     """
 
     rounds: NonNegativeInt = 0
@@ -68,9 +68,9 @@ class PoseRefinement:
     seed: NonNegativeInt = 0
 
     def refine(self, views: PosedViews, held_out: int) -> PosedViews:
-        """Return the views at corrected poses, including the last ``held_out``, which train no field.
+        """Return the views at corrected poses, including the last ``held_out``, to which no field is fitted.
 
-        Photographs determine the cameras only up to a similarity of all of them; it is chosen such that the cameras
+        Photographs determine the cameras only up to a similarity that they share, which is chosen so that the cameras
         stay where they were on average.
 
         Raises:
@@ -89,8 +89,8 @@ class PoseRefinement:
         shifted = (poses[:, :3, 3] - given[:, :3, 3]).norm(dim=-1)
         turned = rotation_angle(poses[:, :3, :3], given[:, :3, :3])
         _log.info(
-            "%d cameras corrected: by %.4f radii and %.2f degrees (medians; largest %.4f and %.2f); robust error of "
-            "renders by round %s",
+            "%d cameras corrected by %.4f radii and %.2f degrees (medians; largest %.4f and %.2f); robust error of "
+            "renders in each round: %s",
             len(views), float(shifted.median()), math.degrees(float(turned.median())), float(shifted.max()),
             math.degrees(float(turned.max())), ", ".join(f"{error:.5f}" for error in errors),
         )  # fmt: skip
@@ -132,10 +132,10 @@ def reduce_views(views: PosedViews, size: int) -> PosedViews:
 def align(
     field: RadianceField, views: PosedViews, updates: int, renderer: NerfRenderer | None = None
 ) -> tuple[Float[Tensor, "views 4 4"], float]:
-    """Return the poses after ``updates`` Gauss-Newton steps on Fair's loss of renders against views, and its mean.
+    """Take ``updates`` Gauss-Newton steps on Fair's loss of renders against views; return poses and their mean loss.
 
-    Each camera gets the pose with the smallest loss among those it passed through, including the given one, so that a
-    step that overshoots is not kept.
+    Each camera gets the pose with the smallest loss among those it passed through, including the given one, so that no
+    step that overshoots is kept.
     """
     renderer = renderer or NerfRenderer("draft")
     parts = torch.arange(len(views)).split(VIEWS_AT_ONCE)
@@ -167,7 +167,7 @@ def _align(
 def gauss_newton_step(
     jacobian: Float[Tensor, "views n 6"], residual: Float[Tensor, "views n"]
 ) -> Float[Tensor, "views 6"]:
-    """Minimise the weighted squares of residual - jacobian step.
+    """Find the step that minimises the weighted sum of squares of residual - jacobian step, with damping.
 
     The weights come from Fair's loss (iteratively reweighted least squares). The step is zero for a camera whose
     image does not change with any motion.
@@ -228,7 +228,7 @@ def _cross(vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
 
 
 def rotation_angle(a: Float[Tensor, "*n 3 3"], b: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n"]:
-    """Return the angle in radians between rotations, exact for small angles, where arccos is not."""
+    """Return the angle in radians between rotations, accurate for small angles, where arccos is not."""
     chord = (a - b).flatten(-2).norm(dim=-1) / math.sqrt(8.0)  # sine of half the angle
     return 2.0 * torch.asin(chord.clamp_max(1.0))
 
@@ -236,8 +236,8 @@ def rotation_angle(a: Float[Tensor, "*n 3 3"], b: Float[Tensor, "*n 3 3"]) -> Fl
 def onto(poses: Float[Tensor, "views 4 4"], given: Float[Tensor, "views 4 4"]) -> Float[Tensor, "views 4 4"]:
     """Move the poses by the least-squares similarity that takes their cameras to the given ones (Umeyama 1991).
 
-    It is fitted to the cameras' positions and to points at one radius along each camera's axes, so that two cameras
-    determine it.
+    It is fitted to the cameras' positions and to the points one object radius away along each camera's axes, so that
+    two cameras determine it.
     """
     matrix, _, _ = procrustes(_points(poses), _points(given), reflection=False)
     similarity = torch.from_numpy(matrix).to(poses)

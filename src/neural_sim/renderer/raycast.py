@@ -17,13 +17,13 @@ from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.surface import Surface
 from neural_sim.types import PinholeCamera
 
-# Offsets from a pixel's centre, right and down: the usual rotated grid of OpenGL's 4x multisampling, which pyrender
-# uses; with it, both renderers' silhouettes agree to a sample.
+# Offsets from a pixel's centre in pixels, right and down: the usual rotated grid of OpenGL's 4x multisampling, which
+# pyrender uses. With it, the silhouettes of both renderers agree to a sample.
 EDGE_SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
 
 
 class RaycastRenderer(MeshRenderer):
-    """Renders the same image as ``PyrenderRenderer`` without OpenGL: rays by embree, textures filtered by footprint."""
+    """Renders what ``PyrenderRenderer`` does, without OpenGL: embree casts rays, mipmaps filter textures."""
 
     name = "raycast"
 
@@ -39,7 +39,7 @@ class RaycastRenderer(MeshRenderer):
 def _cast(
     mesh: trimesh.Trimesh, surface: Surface, pyramids: Sequence[Pyramid], camera: PinholeCamera, pose: Tensor
 ) -> Float[np.ndarray, "h w 4"]:
-    """Cast a ray through each pixel's centre, and four more along the silhouette; return premultiplied RGBA."""
+    """Cast a ray through each pixel's centre, but four through a silhouette's pixel; return premultiplied RGBA."""
     bundle = rays(camera, pose)
     origins, directions = bundle.origins.reshape(-1, 3).numpy(), bundle.directions.reshape(-1, 3).numpy()
     image = _trace(mesh, surface, pyramids, camera, origins, directions)
@@ -107,11 +107,11 @@ def _colours(
     place = np.einsum("nk,nkc->nc", weights, uv)
     page = surface.page[face]
     for number, pyramid in enumerate(pyramids):
-        of = page == number
-        texels = uv_area[of] * pyramid.texels / np.maximum(area[of], 1e-12)
+        on_page = page == number
+        texels = uv_area[on_page] * pyramid.texels / np.maximum(area[on_page], 1e-12)
         # OpenGL's isotropic filter uses the longer side of the footprint, which a slanted face stretches.
-        texels_a_side = np.sqrt(texels) * sample[of] / np.maximum(np.abs(cosine[of]), 0.05)
-        colour[of] = colour[of] * pyramid.sample(place[of], np.log2(texels_a_side + 1e-12))
+        texels_a_side = np.sqrt(texels) * sample[on_page] / np.maximum(np.abs(cosine[on_page]), 0.05)
+        colour[on_page] = colour[on_page] * pyramid.sample(place[on_page], np.log2(texels_a_side + 1e-12))
     return np.clip(colour, 0.0, 1.0)
 
 
@@ -135,7 +135,7 @@ def _barycentric(
 
 
 class Pyramid:
-    """A texture and its halvings; ``sample`` blends the two levels nearest to the wanted footprint."""
+    """A texture and its mipmaps, each half the size of the last; ``sample`` blends two neighbouring levels."""
 
     def __init__(
         self, texture: UInt8[np.ndarray, "h w 3"], wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
@@ -179,7 +179,7 @@ def _bilinear(texture: np.ndarray, uv: np.ndarray, wrap: tuple[Wrap, Wrap]) -> n
 
 
 def _wrapped(index: Int[np.ndarray, "n"], size: int, wrap: Wrap) -> Int[np.ndarray, "n"]:
-    """Return the texels that replace indices beyond the edges."""
+    """Return texel indices, with those beyond the edges replaced by indices inside."""
     if wrap == "clamp":
         return np.clip(index, 0, size - 1)
     if wrap == "mirror":

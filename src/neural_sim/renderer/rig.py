@@ -1,4 +1,4 @@
-"""The anchor lights that an illumination weighs, and the lights of training views."""
+"""The anchor lights that an illumination mixes, and the lights of training views."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class LightRig:
     def __post_init__(self) -> None:
         if self.ambient + self.intensity_range[1] > 1.0 + 1e-9:
             raise ValueError(
-                f"LightRig.ambient: want at most 1 with the largest intensity, {self.intensity_range[1]}, or white "
-                f"surfaces saturate; got {self.ambient}"
+                f"LightRig.ambient: want at most 1 together with the largest intensity, {self.intensity_range[1]}, so "
+                f"that white surfaces do not saturate; got {self.ambient}"
             )
 
     def lights(self) -> tuple[Light, ...]:
@@ -90,8 +90,8 @@ class LightRig:
 class VariedLight:
     """The lights under which a field's training views are rendered.
 
-    A fraction ``anchored`` of the views, evenly spread, sees one anchor each, in turn. The rest sees mixtures, also in
-    turn: ``mixtures`` different ones, uniform over the simplex.
+    A fraction ``anchored`` of the views, evenly spread, are lit by one anchor each, in turn. The others are lit by
+    mixtures, also in turn; there are ``mixtures`` of these, drawn uniformly from the simplex.
     """
 
     rig: LightRig = field(default_factory=LightRig)
@@ -101,7 +101,8 @@ class VariedLight:
     def weights(self, count: int, generator: torch.Generator) -> Float[Tensor, "count k"]:
         """Return each view's weights over the anchors, float32.
 
-        Raises ``ValueError`` if there are too few views to show every anchor.
+        Raises:
+            ValueError: there are too few views to show every anchor.
         """
         k = self.rig.anchors
         if math.floor(count * self.anchored) < k:

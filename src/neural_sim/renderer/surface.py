@@ -17,12 +17,11 @@ from neural_sim.renderer.lighting import Lighting, lambert
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh with baked light: its colour is albedo times shade, both interpolated over each triangle.
+    """A mesh with baked light: its colour is albedo times shade at each vertex, interpolated, times any texture.
 
-    The light and the object share one frame. The shade therefore belongs to the vertex, and renderers need not agree on
-    lights or materials. ``front`` applies where a face is seen from outside, ``back`` from inside (open and badly wound
-    meshes). ``albedo``, per vertex in [0, 1], is white where a texture carries the colour. ``page`` is each face's
-    texture, -1: none.
+    Light is fixed in the object's frame, so the shade does not depend on the view, and renderers need not agree on
+    lights or materials. The shade is ``front`` where a face is seen from outside, ``back`` where it is seen from inside
+    (open and badly wound meshes). ``albedo`` is in [0, 1]. ``page`` is the index of each face's texture, -1: none.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -36,10 +35,11 @@ class Surface:
 
 
 def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
-    """Read geometry, colours and texture from a trimesh with any kind of visual.
+    """Read geometry, colours and textures from a mesh, and shade it.
 
-    Raises ``ValueError`` for a mesh without faces, or with vertices or normals that are not finite
-    (``neural_sim.objects.repair`` repairs those).
+    Raises:
+        ValueError: the mesh has no faces, neither colours nor a texture, or vertices or normals that are not finite
+            (which ``neural_sim.objects.repair`` repairs).
     """
     if len(mesh.faces) == 0:
         raise ValueError("renderer: the mesh has no faces")

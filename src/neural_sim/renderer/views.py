@@ -28,10 +28,10 @@ from neural_sim.types import PinholeCamera, PosedViews
 log = logging.getLogger(__name__)
 
 Backend = Literal["auto", "pyrender", "raycast"]
-"""Backend that draws meshes. auto: pyrender over EGL, else over OSMesa, else ray casting, with a line in the log."""
+"""Backend that draws meshes. auto: pyrender over EGL, else over OSMesa, else ray casting, which the log says."""
 
 PROBE_SECONDS = 60
-# It draws a triangle, because a context that was created may still fail at its first shader.
+# The probe draws a triangle, because a context may be created and still fail at its first shader.
 PROBE = """
 import numpy, pyrender
 scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
@@ -67,7 +67,7 @@ def choose_mesh_renderer(
             )
         log.warning("No OpenGL (EGL, OSMesa) on this machine: meshes are drawn by ray casting, more slowly")
         return RaycastRenderer(supersample, lighting)
-    # PyOpenGL chooses its platform when it is first imported, so the variable is set before.
+    # PyOpenGL chooses its platform when it is first imported, so the variable must be set before.
     os.environ["PYOPENGL_PLATFORM"] = platform
     from neural_sim.renderer.mesh import PyrenderRenderer
 
@@ -79,8 +79,8 @@ def choose_mesh_renderer(
 def opengl_platform() -> str | None:
     """Return ``egl`` or ``osmesa``, the first that draws a triangle in another process; None if neither does.
 
-    This process cannot try them: PyOpenGL keeps the first platform, and a broken driver may abort. If the user has set
-    PYOPENGL_PLATFORM, only that is tried.
+    This process cannot try them itself: PyOpenGL keeps its first platform, and a broken driver may abort the process.
+    If PYOPENGL_PLATFORM is set, only that platform is tried.
     """
     wanted = os.environ.get("PYOPENGL_PLATFORM")
     for platform in (wanted,) if wanted else ("egl", "osmesa"):
@@ -147,7 +147,7 @@ class Views:
 
     def __post_init__(self) -> None:
         if self.lights is not None:
-            self.lights.weights(self.count, torch.Generator())  # each anchor must light a view
+            self.lights.weights(self.count, torch.Generator())  # raises unless each anchor lights a view
 
     def camera(self, image_size: int) -> PinholeCamera:
         """Return the square camera of this field of view."""
