@@ -106,5 +106,5 @@ def test_the_same_seed_gives_the_same_bits(lit_ball: LitBall) -> None:
 
 def test_more_anchors_than_views_are_refused(lit_ball: LitBall) -> None:
     views = lit_ball(4, 5)
-    with pytest.raises(ValueError, match="6 anchors of 4"):
+    with pytest.raises(ValueError, match="anchors: want at most 4, the number of views, got 6"):
         fitted(PosedViews(views.images, views.camera_to_world, views.camera))

@@ -123,7 +123,7 @@ def test_bad_budgets_are_refused() -> None:
 def test_a_fit_that_diverges_is_refused() -> None:
     """Held-out views have no score then, which would read as if there were none of them."""
     with pytest.raises(
-        ValueError, match=r"field: its loss is nan after 8 steps: want smaller learning rates"
+        ValueError, match=r"field: the loss is nan after 8 steps: want smaller learning rates"
     ):
         fit_field(ball_views(), fitting(learning_rate=1e38), torch.Generator().manual_seed(0), steps=8)
 

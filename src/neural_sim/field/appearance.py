@@ -1,9 +1,9 @@
-"""A grid field in which only colour depends on an appearance code (NeRF in the Wild, Martin-Brualla 2021).
+"""A grid field in which only colour depends on an appearance code (NeRF in the Wild, Martin-Brualla et al. 2021).
 
 The code scales the hidden units of the colour head. The gains 1 + W c are the same at every sample, so that a field
 under one code is as fast as one without; and the colour's logits are affine in the code, as shading is linear in light.
-(The alternative, appending the code to the hidden layer's input, amounts to a shift of its bias. On sides rendered
-under a light in which no view shows them, it is about 2 dB worse.)
+(The alternative, appending the code to the hidden layer's input, only shifts the layer's bias. It is about 2 dB worse
+on sides rendered under a light in which no training view shows them.)
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ INITIAL_CODE = 0.3
 class AppearanceField(RadianceField):
     """``GridField`` for density and features, and a colour head with one hidden layer over features and a code.
 
-    The first three features also go directly to the colour's logits, so that the head only has to learn the light.
+    The first three features are also added to the colour's logits, so that the head only has to learn the light.
     ``learned`` codes of ``code_size`` numbers are fitted, one for each light of the training views or one for each
-    view. The ``anchors``, which an illumination weighs, are k affine combinations of them: rows of ``mixing`` (k,
+    view. The ``anchors``, which an illumination mixes, are k affine combinations of them: rows of ``mixing`` (k,
     learned) add up to 1. With ``view_dependent`` the head also sees the viewing direction, which Lambertian objects do
     not need. A query without a code uses the mean of the anchors.
     """
@@ -85,7 +85,7 @@ class AppearanceField(RadianceField):
 
     @property
     def anchors(self) -> Float[Tensor, "k code"]:
-        """The codes that an illumination weighs."""
+        """The codes that an illumination mixes."""
         return self.mixing @ self.codes
 
     def lit(self, code: Float[Tensor, "code"], rates: Float[Tensor, "q code"] | None = None) -> LitField:
@@ -211,7 +211,7 @@ class LitField(RadianceField):
         velocities: Float[Tensor, "m samples 3"],
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See the base class, but m may be 0. In closed form: a moving light costs one small product per sample."""
+        """See the base class; here m may be 0. In closed form, so a moving light costs one small product a sample."""
         field, grid = self.field, self.field.grid
         raw, raw_rates = grid.raw_with_tangents(positions, velocities)
         before = field.into(field.seen(raw, directions))

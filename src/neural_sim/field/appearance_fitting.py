@@ -35,9 +35,9 @@ class AppearanceFitting(Fitting):
 
     Args:
         grid: makes the fitting of the field's grid.
-        shared_lights: if light weights are known, a view's code is the same combination of the anchors' codes, so that
-            the look of a side under one light is learned from all views of that side. Otherwise, and for photographs,
-            each view learns its own code (NeRF in the Wild).
+        shared_lights: if light weights are known, a view's code combines the anchors' codes by its weights, so that the
+            look of a side under one light is learned from all views of that side. Otherwise, and for photographs, each
+            view learns its own code (NeRF in the Wild).
         anchors: number of views, evenly spread, whose codes become the anchors if no light weights are known.
         transients: learn what single views show in front of the object, and how uncertain each pixel is. This is for
             photographs, in which somebody may walk through the picture; rendered views have no transients. They are
@@ -86,12 +86,13 @@ class AppearanceFitting(Fitting):
         if weights is not None and self.shared_lights:
             return weights, torch.eye(weights.shape[1]).to(weights)
         own = torch.eye(len(views)).to(views.images)
-        if (
-            weights is not None
-        ):  # least squares: the anchors whose mixtures come closest to the views' own codes
+        if weights is not None:
+            # Least squares: the anchors whose mixtures come closest to the views' own codes.
             return own, torch.linalg.pinv(weights.double()).to(weights)
         if self.anchors > len(views):
-            raise ValueError(f"AppearanceFitting: want {self.anchors} anchors of {len(views)} views")
+            raise ValueError(
+                f"AppearanceFitting.anchors: want at most {len(views)}, the number of views, got {self.anchors}"
+            )
         return own, own[torch.linspace(0, len(views) - 1, self.anchors).long()]
 
     @override

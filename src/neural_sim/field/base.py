@@ -43,7 +43,7 @@ class RadianceField(nn.Module, ABC):
         Float[Tensor, "m samples"],
         Float[Tensor, "m samples 3"],
     ]:
-        """Return ``query``, with m >= 1 derivatives as positions move at ``velocities`` and directions at ``turns``.
+        """Return ``query`` and its m >= 1 derivatives for positions moving at ``velocities``, directions at ``turns``.
 
         Under a moving light, colour has ``light_rates`` more derivatives than density; they come last.
 
@@ -80,8 +80,8 @@ class RadianceField(nn.Module, ABC):
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         """Compute premultiplied colour and opacity of rays (rays, 3) by quadrature on the samples of ``sample``.
 
-        It is not differentiable. ``span`` has the rays' distances from the method ``span``; with ``skip_empty``, space
-        known to be empty is skipped. Neither changes a pixel, and fields that know no empty space ignore both.
+        It is not differentiable. ``span`` is what the method ``span`` returned for these rays; with ``skip_empty``,
+        space known to be empty is skipped. Neither changes a pixel, and fields that know no empty space ignore both.
         ``surface``, if given, records where the rays lose half of their light.
         """
         samples = self.sample(rays, termination)

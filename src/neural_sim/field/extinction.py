@@ -1,4 +1,4 @@
-"""Transmittance along rays that are marched wave by wave, and the rays that it terminates."""
+"""Optical depth along rays that are marched wave by wave: where rays end, and where half of their light is lost."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ HALF = math.log(2.0)
 
 
 class Extinction:
-    """Optical depth that each of ``rays`` has gathered so far; samples behind ``termination`` do not count.
+    """Optical depth that each of ``rays`` rays has gathered so far.
 
-    Sums run along one ray only, so that the dtype of the rays keeps enough digits.
+    Samples behind a transmittance of ``termination`` do not count. Each sum runs along one ray only, so that the rays'
+    own dtype keeps enough digits.
     """
 
     def __init__(self, rays: int, termination: float, like: Float[Tensor, "*any"]) -> None:
@@ -29,8 +30,8 @@ class Extinction:
     def enter(
         self, wave: Wave, optical: Float[Tensor, "k"]
     ) -> tuple[Float[Tensor, "k"], Bool[Tensor, "k"], Bool[Tensor, "n"]]:
-        """Return the depth before each sample of thickness ``optical``, which samples count, which rays continue."""
-        # One more column than steps: the sum before each sample is read directly, without subtracting its own depth.
+        """Return the depth before each sample of depth ``optical``, which samples count, and which rays continue."""
+        # One more column than steps, so that the sum before each sample is read directly, not by subtraction.
         thickness = optical.new_zeros(len(wave.ray), wave.length + 1)
         thickness[:, 0] = self._depth.index_select(0, wave.ray)
         slot = wave.place + wave.row
@@ -39,7 +40,7 @@ class Extinction:
         before = depth.view(-1).index_select(0, slot)
         after = depth[:, -1]
         alive = after < self._deepest
-        # The sample that crosses the limit is the last to count. Depth rises along a row, so that a search finds it.
+        # The sample that crosses the limit is the last to count. Depth rises along a row, so a search finds it.
         limit = torch.full_like(after, self._deepest)[:, None]
         crossing = torch.searchsorted(depth, limit).clamp_max(wave.length)
         self._depth.index_copy_(0, wave.ray, depth.gather(1, crossing)[:, 0])
@@ -51,10 +52,10 @@ class Extinction:
 
 
 class Surface:
-    """Where each of ``rays`` has lost half of its light: the distance, in object radii, at which transmittance is 1/2.
+    """Where each of ``rays`` rays has lost half of its light: the distance in object radii of transmittance 1/2.
 
-    ``distance`` is 0 for rays that lose less, which have an opacity below 1/2. As in the quadrature, density is
-    constant over the length of ray that a sample represents.
+    ``distance`` is 0 for rays that lose less than half (opacity below 1/2). As in the quadrature, density is constant
+    over the length of ray that a sample represents.
     """
 
     def __init__(self, rays: int, like: Float[Tensor, "*any"]) -> None:
@@ -68,10 +69,14 @@ class Surface:
         before: Float[Tensor, "k"],
         optical: Float[Tensor, "k"],
     ) -> None:
-        """Add samples of rays ``ray``.
+        """Add samples.
 
-        They are given by the distances of their middles, the lengths that they represent, the optical depth before
-        each, and the optical depth of each.
+        Args:
+            ray: the ray of each sample.
+            middle: the distance of its middle.
+            width: the length of ray that it represents.
+            before: the optical depth before it.
+            optical: its own optical depth.
         """
         here = ((before < HALF) & (before + optical >= HALF)).nonzero()[:, 0]
         fraction = (HALF - before.index_select(0, here)) / optical.index_select(0, here)
@@ -81,7 +86,7 @@ class Surface:
 
 
 def sum_rows(values: Float[Tensor, "k c"], weights: Float[Tensor, "k"], wave: Wave) -> Float[Tensor, "n c"]:
-    """Return the weighted sum of the samples of each of a wave's rays."""
+    """Sum the weighted samples of each ray in a wave."""
     every = torch.arange(len(values), device=values.device)
     first = wave.count.cumsum(0) - wave.count
     return functional.embedding_bag(every, values, first, per_sample_weights=weights, mode="sum")

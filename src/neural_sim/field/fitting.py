@@ -27,25 +27,26 @@ from neural_sim.types import PosedViews
 
 BelowOne = Annotated[float, Ge(0), Lt(1)]
 LARGE = 0.05
-"""Smallest connected part that is kept of a field of photographs, relative to the largest part: poses are not exact,
-and where few cameras look, a field has pictures of its own in the air."""
+"""Smallest connected part that is kept in a field of photographs, relative to the largest part. Poses are inexact, and
+where few cameras look, the field contains floaters: matter in the air that explains single photographs."""
 BRIDGED = 2
-"""Number of cells by which parts are grown before they are connected: a surface may have holes around its pieces."""
+"""Number of cells by which parts are dilated before they are labelled, because a surface may have gaps."""
 SPREAD = 0.25
 """Factor on ``prune_weight`` for photographs. Inexact cameras and blur spread a surface over several cells, each of
-which contributes less; with the whole weight, walls had holes."""
+which contributes less; with the full weight, surfaces got holes."""
 BATCHES_PER_BLOCK = 8
-"""Number of batches whose samples are chosen at once; each choice has a fixed cost."""
+"""Number of batches whose samples are chosen at once, because each choice has a fixed cost."""
 
 
 @validated
 class GridFitting(Fitting):
-    """Fits coarse to fine, first in the visual hull's cells; ``refine_steps`` drop empty cells and halve the others.
+    """Fits coarse to fine, first in the visual hull's cells.
 
-    ``resolution`` is the final number of cells along the unit sphere's diameter; with n refinements the first is
-    ``resolution`` / 2^n. ``prune_steps`` drop cells without halving. A cell stays if it or a neighbour holds a sample
-    that contributes more than ``prune_weight`` (for photographs, ``SPREAD`` of it) to one of ``prune_rays`` pixels.
-    Samples behind a transmittance of ``termination`` are dropped.
+    At each of ``refine_steps``, empty cells are dropped and the edges of the others are halved; at ``prune_steps``,
+    empty cells are dropped. ``resolution`` is the final number of cells along the unit sphere's diameter; with n
+    refinements, the first is ``resolution`` / 2^n. A cell stays if it or a neighbour holds a sample that contributes
+    more than ``prune_weight`` (for photographs, ``SPREAD`` times that) to one of ``prune_rays`` pixels. Samples behind
+    a transmittance of ``termination`` are dropped.
     """
 
     field: GridField
@@ -82,7 +83,7 @@ class GridFitting(Fitting):
         occupied, origin, cell = visual_hull(views, self.resolution >> len(self.refine_steps))
         occupied, origin = crop(occupied, origin, cell)
         self.field.reset(occupied, origin, cell)
-        # A hull cell projects to at most two of its own diagonals beyond the silhouette (see ``visual_hull``).
+        # A hull cell reaches at most one diagonal beyond the silhouette, as its centre is within half of one.
         border = pixels_across(views, math.sqrt(3.0) * cell)
         self._blocks = RayBlocks(build_pool(views, border, generator))
         self._ready = []
@@ -128,7 +129,7 @@ class GridFitting(Fitting):
 
     @override
     def state(self) -> dict[str, Any] | None:
-        # The samples of a block's batches were chosen with the densities at its first step.
+        # No fit resumes within a block: its samples were chosen with the densities at its first step.
         return None if self._ready else {"field": self.field.state_dict(), "next": self._blocks.next}
 
     @override
@@ -138,7 +139,7 @@ class GridFitting(Fitting):
 
     @torch.no_grad()
     def _seen_cells(self) -> Bool[Tensor, "cells"]:
-        """Find the occupied cells (in packed order) that are visible in some pixel."""
+        """Find which of the occupied cells, in packed order, some pixel shows."""
         largest = self.field.table.new_zeros(self.field.occupancy.count)
         size = self.batch_rays * BATCHES_PER_BLOCK
         for _ in range(math.ceil(self.prune_rays / size)):
@@ -158,7 +159,7 @@ class GridFitting(Fitting):
 
 
 def _large_parts(occupied: Bool[Tensor, "nx ny nz"], seen: Bool[Tensor, "cells"]) -> Bool[Tensor, "cells"]:
-    """Find the cells in connected parts of at least ``LARGE`` times the largest one; smaller parts are floaters."""
+    """Find the seen cells in connected parts of at least ``LARGE`` times the largest; smaller parts are floaters."""
     grid = torch.zeros_like(occupied)
     grid[occupied] = seen
     parts = np.zeros(tuple(grid.shape), dtype=np.int64)

@@ -32,18 +32,18 @@ from neural_sim.ranges import NonNegativeInt, Positive, validated
 from neural_sim.types import PinholeCamera, Rays
 
 EMPTY_DENSITY = -1e4
-"""Raw density in the row for all empty space: softplus gives exactly 0."""
+"""Raw density in the table's row for empty space, so low that its softplus is exactly 0."""
 
 
 @validated
 class GridField(RadianceField):
-    """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, at any scale of the grid.
+    """A trilinear field over occupied cells; sigma = softplus(gain raw) / cell edge, whatever the grid's scale.
 
-    ``features`` numbers at each vertex give the colour. With ``head_width`` 0 the first three pass through a sigmoid
-    (no view dependence; a Lambertian object under a fixed light needs none); otherwise a head with one hidden layer
-    sees them and the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is the
-    argument of softplus in a new field; ``density_gain`` lets density learn that much faster than colour. A new field
-    holds the cube [-1, 1]^3 in one cell; ``reset`` sets its occupancy.
+    ``features`` numbers at each vertex give the colour. With ``head_width`` 0, the first three pass through a sigmoid
+    (no view dependence; a Lambertian object under a fixed light needs none); otherwise, a head with one hidden layer
+    sees all of them and the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is
+    the argument of softplus in a new field; ``density_gain`` is the factor by which density learns faster than colour.
+    A new field is one cell, the cube [-1, 1]^3; ``reset`` sets its occupancy.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class GridField(RadianceField):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
         """Move and cast like any module, but reject a dtype that cannot resolve positions within a cell."""
-        # Half precision would not pay for colour alone either: decoding is 6 % of a render on a CPU.
+        # Nor would half precision pay for colour alone: decoding is 6 % of a render on a CPU.
         wanted = fn(self.table.detach()[:0]).dtype
         if wanted not in (torch.float32, torch.float64):
             raise ValueError(f"GridField: want float32 or float64, got {wanted}")
@@ -106,7 +106,7 @@ class GridField(RadianceField):
         return other
 
     def reset(self, occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float) -> None:
-        """Start over with these cells: raw density ``initial_density``, features 0."""
+        """Start over with these cells, ``initial_density`` as the argument of softplus, and features of 0."""
         coordinates = self._set_cells(occupied, origin, cell)
         table = self.table.new_zeros(len(coordinates) + 1, 1 + self.features)
         table[:, 0] = self.initial_density / self.density_gain
@@ -117,8 +117,8 @@ class GridField(RadianceField):
     def keep(self, cells: Bool[Tensor, "cells"], refine: bool) -> None:
         """Drop the occupied cells that are not in ``cells``, except neighbours of those that stay.
 
-        With ``refine`` the edge of cells is halved first, so that the margin of neighbours is thinner, and the table is
-        interpolated.
+        With ``refine``, the edge of cells is halved first, so that the margin of neighbours is thinner. The table is
+        interpolated at the new vertices.
         """
         wanted, occupied, cell = torch.zeros_like(self.occupied), self.occupied, self.edge
         wanted[occupied] = cells
@@ -129,7 +129,7 @@ class GridField(RadianceField):
         before, table, old_cell, old_origin = self.occupancy, self.table, self.edge, self.origin
         corners = self.corners
         coordinates = self._set_cells(occupied, origin, cell)
-        # New vertices lie on the boundaries of old cells; nudged into an occupied one, each finds a row.
+        # A new vertex may lie on the boundary of old cells; it is interpolated in one of them that is occupied.
         local = (origin - old_origin + coordinates.to(table.dtype) * cell) / old_cell
         rows = _interpolate_from(local, before, corners, table)
         self.table = nn.Parameter(torch.cat([rows, table[-1:]]))
@@ -167,7 +167,7 @@ class GridField(RadianceField):
         velocities: Float[Tensor, "m samples 3"],
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See the base class; in closed form except for a head, at little more than the cost of ``query``."""
+        """See the base class; without a head in closed form, at little more than the cost of ``query``."""
         raw, raw_rates = self.raw_with_tangents(positions, velocities)
         sigma_rates = self.density_rates(raw, raw_rates)
         sigma, rgb = self.decode(raw, directions)
@@ -305,7 +305,7 @@ def _resize_to_state(field: nn.Module, state: dict[str, Tensor], prefix: str, *_
 def _interpolate_from(
     local: Float[Tensor, "vertices 3"], occupancy: Occupancy, corners: Tensor, table: Tensor
 ) -> Float[Tensor, "vertices channels"]:
-    """Interpolate an old table at grid vertices, each in any occupied cell of the eight around it."""
+    """Interpolate an old table at vertices, each within an occupied cell that contains or touches it."""
     result = table.new_zeros(len(local), table.shape[1])
     missing = torch.arange(len(local), device=local.device)
     for corner in CORNERS:

@@ -20,9 +20,9 @@ Resolution = Annotated[
     int,
     Matching(lambda cells: cells >= COARSEST and cells & (cells - 1) == 0, f"a power of two from {COARSEST}"),
 ]
-"""Number of cells along the unit sphere's diameter that can be carved, coarse to fine."""
+"""Number of cells along the unit sphere's diameter, such that they can be carved coarse to fine."""
 DISSENT = 0.1
-"""Fraction of the photographs seeing a cell that may show no object there: their poses and masks are not exact."""
+"""Largest fraction of the photographs of a cell that may show no object there, as poses and masks are not exact."""
 
 
 def visual_hull(
@@ -30,12 +30,13 @@ def visual_hull(
 ) -> tuple[Bool[Tensor, "nx ny nz"], Float[Tensor, "3"], float]:
     """Find the cells of the unit sphere that the object may occupy; [-1, 1]^3 has ``resolution`` along each edge.
 
-    A cell is removed if some view that sees its centre has no pixel above ``alpha_threshold`` within the circle that
-    the cell can cover, so that the hull is never too small. With photographs (``views.known``), more than the fraction
-    ``DISSENT`` of those that show the cell must agree to remove it. Returns cells, origin and edge length in object
-    radii.
+    A cell is removed if some view that sees its centre has no pixel above ``alpha_threshold`` in a square that contains
+    the cell's projection, so that the hull is never too small. With photographs (``views.known``), more than the
+    fraction ``DISSENT`` of those that show the cell must agree to remove it. Returns cells, origin and edge length in
+    object radii.
 
-    Raises ValueError if the resolution is invalid or no cell is left (the silhouettes contradict each other).
+    Raises:
+        ValueError: the resolution is invalid, or no cell is left (the silhouettes contradict each other).
     """
     check(resolution, Resolution, "visual_hull.resolution")
     pose = views.camera_to_world
@@ -62,7 +63,10 @@ def visual_hull(
 
 
 def pixels_across(views: PosedViews, length: float) -> int:
-    """Return the largest number of pixels that a length in the unit sphere covers in any view, rounded up."""
+    """Bound the number of pixels that a length in the unit sphere covers in any view.
+
+    A camera nearer to the sphere than 0.25 counts as 0.25 away.
+    """
     nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
     return math.ceil(max(focal_lengths(views.camera)) * length / nearest) + 1
 
@@ -70,7 +74,7 @@ def pixels_across(views: PosedViews, length: float) -> int:
 def _inside_all(
     views: PosedViews, centres: Float[Tensor, "cells 3"], radius: float, alpha_threshold: float
 ) -> Bool[Tensor, "cells"]:
-    """Find the centres within ``radius`` of the object in the views that see them; unseen centres stay."""
+    """Find the centres within ``radius`` of the silhouettes in the views that see them; unseen centres stay."""
     camera, reach = views.camera, pixels_across(views, radius)
     (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
     mask = views.images[..., 3] > alpha_threshold

@@ -1,7 +1,7 @@
-"""Trilinear interpolation in a packed table, with rows only for occupied vertices, found through an array of corners.
+"""Trilinear interpolation in a packed table, with rows only for vertices of occupied cells.
 
-On a CPU this is one ``index_select`` and one small batched product; 3-D ``grid_sample`` is about ten times slower
-and has no forward-over-reverse derivatives.
+An array of corners has the rows of each cell. On a CPU, interpolation is one ``index_select`` and one small batched
+product; 3-D ``grid_sample`` is about ten times slower and has no forward-over-reverse derivatives.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 from neural_sim.devices import at_once
 
 SCATTERED = 8192
-"""Number of samples whose derivatives are scattered at a time on a CPU."""
+"""Number of samples whose gradients are scattered into the table at once on a CPU."""
 
 CORNERS = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 """Offsets of a cell's eight vertices, in the order of ``trilinear_weights``."""
@@ -45,8 +45,7 @@ def trilinear_tangents(
 ) -> tuple[Float[Tensor, "samples 8"], Float[Tensor, "m samples 8"]]:
     """Compute ``trilinear_weights``, and their derivatives for a fraction that moves at ``velocities``.
 
-    The computation goes coordinate by coordinate over all samples, so that every operation runs over contiguous memory.
-    Not differentiable.
+    Each operation runs over all samples of one coordinate, so that its memory is contiguous. Not differentiable.
     """
     x, y, z = fraction.detach().t().contiguous().unbind(0)
     edges = _bilinear(x, y)
@@ -74,7 +73,7 @@ def gather_weighted(
     corners: Int[Tensor, "samples 8"],
     weights: Float[Tensor, "samples 8"],
 ) -> Float[Tensor, "samples channels"]:
-    """Interpolate in one fused operation, several times faster than ``interpolate``, without derivatives."""
+    """Interpolate in one fused operation, several times faster than ``interpolate``, where no derivative is needed."""
     return torch.nn.functional.embedding_bag(corners, table, per_sample_weights=weights, mode="sum")
 
 

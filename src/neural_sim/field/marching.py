@@ -1,8 +1,8 @@
-"""Samples of rays in occupied cells, at uniform steps on a fixed lattice that skip empty space and terminated rays.
+"""Sample rays in occupied cells at uniform steps on a fixed lattice, skipping empty space and terminated rays.
 
 The lattice of a ray is t_k = (k + phase) step from the ray's origin, whatever is skipped: skipping empty space
-changes no sample, and the same ray always has the same distances. Coordinates are separate contiguous arrays, which
-on a CPU is several times faster than arrays of points.
+changes no sample, and the same ray always has the same distances. Each coordinate is a contiguous array of its own,
+which on a CPU is several times faster than arrays of points.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from neural_sim.field.quadrature import PackedSamples, Span
 from neural_sim.types import Rays
 
 SHORTEST, LONGEST = 8, 64
-"""Numbers of lattice steps that a ray takes at once after it has reached a coarse occupied cell; powers of two."""
+"""Smallest and largest number of lattice steps that a ray takes at once near an occupied coarse cell; powers of two."""
 POINTS = 131_072
-"""Least points in a wave, so that few rays take longer waves: below it, calls dominate the cost on a CPU."""
+"""Number of points up to which the waves of few rays are lengthened: in smaller ones, the cost of calls dominates."""
 
 Axes = tuple[Tensor, Tensor, Tensor]
 
@@ -52,7 +52,7 @@ Visitor = Callable[[Wave], Bool[Tensor, "n"]]
 
 @dataclass(frozen=True)
 class _Walk:
-    """Rays in cell units: one array for each coordinate, the last lattice step inside, and the lattice's phase."""
+    """Rays in cell units: an array for each coordinate, the last lattice step in the grid, and the lattice's phase."""
 
     origin: Axes
     direction: Axes
@@ -84,12 +84,15 @@ def march(
     span: Span | None = None,
     skip_empty: bool = True,
 ) -> None:
-    """Walk rays of shape (rays, 3) through the grid and pass ``visit`` every wave that may hold occupied cells.
+    """Walk rays of shape (rays, 3) through the grid and pass ``visit`` every wave that may meet occupied cells.
 
     ``step`` is in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. ``span`` may give
-    the distances between which the occupied cells of each ray lie. Without ``skip_empty`` a ray takes every step in the
-    grid's box. Raises ValueError if a ray starts so far away that its arithmetic cannot tell one lattice step from
-    the next (float32: 2^22 steps).
+    the distances between which the occupied cells of each ray lie. Without ``skip_empty``, a ray takes every step in
+    the grid's box.
+
+    Raises:
+        ValueError: a ray starts so far away that its dtype cannot tell one lattice step from the next (float32: 2^22
+            steps).
     """
     unit = step / occupancy.cell
     ray, ahead, every = _enter(rays, occupancy, step, phase, span)
@@ -101,11 +104,11 @@ def march(
         length = SHORTEST
         while 2 * length * len(ray) <= points and length < LONGEST:
             length *= 2
-        # A long wave soon crosses the gap to a nearby occupied coarse cell.
+        # A ray joins the wave a little before an occupied coarse cell, if the wave is long enough to cross the gap.
         there = (away <= length // (4 * COARSENING)).nonzero()[:, 0]
         going = following <= walk.last
         if len(there):
-            # Most rays arrive together, so that a copy of some of them is seldom needed.
+            # Most rays arrive together, so a copy of some of them is seldom needed.
             whole = len(there) == len(ray)
             arrived = walk if whole else walk.select(there)
             number, first = (
@@ -163,7 +166,7 @@ def _enter(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], _Walk]:
     """Return the indices of the rays that meet the grid's box, their first lattice steps inside, and all the rays."""
     origin = ((rays.origins - occupancy.origin) / occupancy.cell).t().contiguous()
-    # A direction component of exactly zero would divide by zero; the smallest slope gives the same span.
+    # A direction component of zero would divide by zero; a tiny one gives the same span.
     slope = rays.directions.t().contiguous()
     slope = torch.where(slope.abs() < 1e-9, torch.full_like(slope, 1e-9), slope)
     beyond = torch.stack([size - axis for axis, size in zip(origin, occupancy.index.shape, strict=True)])
@@ -182,8 +185,8 @@ def _enter(
     farthest = float(last.index_select(0, ray).amax()) if len(ray) else 0.0
     if farthest > limit:
         raise ValueError(
-            f"march: the grid lies {farthest:.3g} steps of {step:.3g} from a ray's origin, {origin.dtype} counts to "
-            f"{limit:.3g}; bring the camera closer"
+            f"march: the grid lies {farthest:.3g} steps of {step:.3g} from a ray's origin, but {origin.dtype} counts "
+            f"only to {limit:.3g}; bring the camera closer"
         )
     x, y, z = origin.unbind(0)
     u, v, w = slope.unbind(0)
@@ -217,27 +220,27 @@ class SampleCollector:
     def __init__(self, rays: int, like: Float[Tensor, "*any"]) -> None:
         number = torch.zeros(0, dtype=torch.int64, device=like.device)
         self._count = torch.zeros(rays, dtype=torch.int64, device=like.device)
-        # One empty part, so that the case in which all rays miss needs no special code.
+        # One empty part, so that rays that all miss need no special case.
         self._parts = [(number, number, like.new_zeros(0), number.to(torch.int32))]
 
     def add(self, wave: Wave, kept: Bool[Tensor, "k"] | None = None) -> None:
-        """Keep the samples of a wave, or some of them."""
+        """Add the samples of a wave, or only those that are ``kept``."""
         row, distance, cell, count = wave.row, wave.distance, wave.cell, wave.count
         if kept is not None:
             index = kept.nonzero()[:, 0]
             row, distance, cell = (part.index_select(0, index) for part in (row, distance, cell))
-            # Differences of a running count: a histogram's size would depend on its values.
+            # Differences of a running count; ``bincount`` would make the host wait for the device.
             ends = torch.nn.functional.pad(kept.cumsum(0), (1, 0)).index_select(0, wave.count.cumsum(0))
             count = torch.diff(ends, prepend=ends.new_zeros(1))
         before = self._count.index_select(0, wave.ray)
-        # Rows come in order: a sample's rank is its number minus that of its row's first sample.
+        # Rows come in order, so a sample's rank is its number minus that of its row's first sample.
         first = before - (count.cumsum(0) - count)
         order = torch.arange(len(row), device=row.device) + first.index_select(0, row)
         self._parts.append((wave.ray.index_select(0, row), order, distance, cell))
         self._count.index_copy_(0, wave.ray, before + count)
 
     def finish(self, width: float) -> tuple[PackedSamples, Int[Tensor, "samples"]]:
-        """Return all samples in packed order, each representing ``width`` of its ray, and their cells."""
+        """Return all samples in packed order, each representing a length ``width`` of its ray, and their cells."""
         starts = torch.nn.functional.pad(self._count.cumsum(0), (1, 0))
         ray, order, distance, cell = (torch.cat(parts) for parts in zip(*self._parts, strict=True))
         place = starts.index_select(0, ray) + order

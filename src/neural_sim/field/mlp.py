@@ -24,7 +24,7 @@ from neural_sim.types import PosedViews, Rays
 
 TwoOrMore = Annotated[int, Ge(2)]
 SKIP_LAYER = 4
-"""The layer at which the encoded position enters again (NeRF, Fig. 7)."""
+"""Index of the layer after which the encoded position enters again (NeRF, Fig. 7)."""
 
 
 def positional_encoding(
@@ -74,7 +74,7 @@ class MLPField(RadianceField):
 
     ``query`` uses the fine network. ``coarse_samples`` uniform samples span the ray's part in the unit sphere;
     ``fine_samples`` more are drawn in proportion to the coarse weights (NeRF, Sec. 5.2), at even quantiles so that
-    ``sample`` is deterministic. ``density_scale`` multiplies softplus, per object radius.
+    ``sample`` is deterministic. ``density_scale`` times softplus is the density per object radius.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ def inverse_cumulative(
     weights: Float[Tensor, "rays bins"],
     quantiles: Float[Tensor, "rays samples"],
 ) -> Float[Tensor, "rays samples"]:
-    """Return where the piecewise uniform density ``weights`` between ``edges`` reaches the given quantiles."""
+    """Return the given quantiles of the density that is uniform between neighbouring ``edges``, with these weights."""
     cumulative = nn.functional.pad(weights.cumsum(1), (1, 0))
     cumulative = cumulative / cumulative[:, -1:]
     right = torch.searchsorted(cumulative, quantiles.contiguous(), right=True).clamp(1, weights.shape[1])
@@ -218,9 +218,9 @@ def _initialise(module: nn.Module, generator: torch.Generator) -> None:
 
 @validated
 class MLPFitting(Fitting):
-    """Fits both networks at once (NeRF, Eq. 6), with stratified noise in the sample distances.
+    """Fits both networks at once (NeRF, Eq. 6), at random stratified sample distances.
 
-    Rays of all pixels are used, because only rays that miss the object show that the space around it is empty.
+    Rays of all pixels are used, because rays that miss the object show that the space around it is empty.
     """
 
     field: MLPField

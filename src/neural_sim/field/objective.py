@@ -36,7 +36,7 @@ class Fitting(ABC):
         """Render the next batch, in every way that the loss needs; also return its pixels (premultiplied RGBA)."""
 
     def loss(self) -> Float[Tensor, ""]:
-        """Return what the next step minimises: the expected error of every rendering of the next batch."""
+        """Return what the next step minimises: the expected errors of all renderings of the next batch, summed."""
         renderings, pixels = self.render()
         return torch.stack([expected_error(rendering, pixels) for rendering in renderings]).sum()
 
@@ -57,9 +57,7 @@ class Fitting(ABC):
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a ``state``, directly after ``start`` on the same views."""
-        raise NotImplementedError(
-            f"{type(self).__name__} returns a state, and needs restore to resume from it"
-        )
+        raise NotImplementedError(f"{type(self).__name__} returns a state but does not implement restore")
 
     @abstractmethod
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
@@ -67,7 +65,7 @@ class Fitting(ABC):
 
 
 class RayBlocks:
-    """Consecutive blocks of a shuffled pool of rays, starting over if less than a block is left.
+    """Hands out consecutive blocks of a shuffled pool of rays, and starts over if less than a block is left.
 
     ``next`` is the start of the next block.
     """

@@ -1,4 +1,4 @@
-"""The occupied cells of a grid: a packed numbering of them, and the distance to the nearest one."""
+"""The occupied cells of a grid: their packed numbers, and the distance to the nearest one."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from torch import Tensor
 from torch.nn import functional
 
 COARSENING = 4
-"""Number of fine cells along one edge of a coarse cell, in which rays skip empty space."""
-NOTHING = "occupancy: no cell is occupied, want at least one (silhouettes empty or all pruned?)"
+"""Number of cells along the edge of a coarse cell; rays skip empty space by coarse cells."""
+NOTHING = (
+    "occupancy: no cell is occupied, want at least one (were all silhouettes empty, or all cells pruned?)"
+)
 FARTHEST = 16
-"""Largest skip, in coarse cells."""
+"""Longest distance in coarse cells; longer ones are recorded as this one."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +23,8 @@ class Occupancy:
     """Cells of edge ``cell`` (object radii) from corner ``origin``.
 
     ``index`` is -1 in empty cells, and elsewhere the cell's number in x-major order. ``distance`` is, for every coarse
-    cell of ``COARSENING`` cubed fine ones, the Chebyshev distance to the nearest occupied one (0: itself), up to
-    ``FARTHEST``.
+    cell of ``COARSENING``^3 cells, the Chebyshev distance in coarse cells to the nearest one with an occupied cell (0:
+    itself), at most ``FARTHEST``.
     """
 
     origin: Float[Tensor, "3"]
@@ -81,7 +83,11 @@ def subdivide(occupied: Bool[Tensor, "nx ny nz"]) -> Bool[Tensor, "mx my mz"]:
 def crop(
     occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float
 ) -> tuple[Bool[Tensor, "mx my mz"], Float[Tensor, "3"]]:
-    """Cut away empty margins; return the smaller grid and its origin. Raises ValueError if no cell is occupied."""
+    """Cut away empty margins; return the smaller grid and its origin.
+
+    Raises:
+        ValueError: no cell is occupied.
+    """
     where = occupied.nonzero()
     if not len(where):
         raise ValueError(NOTHING)

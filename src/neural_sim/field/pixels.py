@@ -15,8 +15,8 @@ from neural_sim.field.quadrature import Span
 from neural_sim.types import PinholeCamera
 
 SMALLEST_STRIP, LARGEST_STRIP = 2048, 16384
-"""Number of pixels of an image processed together, in whole rows, so that a large image needs no more memory than a
-small one. The largest number is a CPU's."""
+"""Smallest and largest number of pixels of an image that are processed together, in whole rows, so that a large image
+needs no more memory than a small one. The largest is a CPU's; see ``at_once`` for other devices."""
 
 
 @dataclass(frozen=True)

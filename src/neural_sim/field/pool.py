@@ -16,7 +16,7 @@ from neural_sim.types import PosedViews, Rays
 
 @dataclass(frozen=True)
 class RayPool:
-    """Rays (rays, 3), their premultiplied RGBA pixels, views, and a phase in [0, 1) that shifts each sample lattice.
+    """Rays (rays, 3), their premultiplied RGBA pixels and views, and the phase in [0, 1) of each ray's sample lattice.
 
     With different phases, neighbouring rays sample different depths, so that no depth is missed.
     """

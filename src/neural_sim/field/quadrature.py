@@ -2,8 +2,8 @@
 
 The quadrature is Max's (1995; NeRF, Mildenhall et al. 2020, Eq. 3). Sums over a ray are differences of one running sum
 over all samples; unlike a scatter, it is fast on a CPU and has both derivative modes. It runs in float64, and no sample
-counts more than ``OPAQUE_DEPTH``, so that rays late in the pack keep their precision: the error for N samples is N
-times the float64 eps times the sum of their counted depths.
+counts for more than ``OPAQUE_DEPTH``, so that rays late in the pack keep their precision: the error for N samples is at
+most N times the float64 eps times the sum of their counted depths.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class PackedSamples:
     def of_rays(self, first: int, last: int, begin: int, end: int) -> PackedSamples:
         """Return the samples ``begin`` to ``end`` - 1, which belong to rays ``first`` to ``last`` - 1, numbered from 0.
 
-        ``begin`` and ``end`` are in ``starts``. They are arguments because reading them here would make the host wait
-        for the device once per batch.
+        ``begin`` and ``end`` could be read from ``starts``, but that would make the host wait for the device once per
+        batch.
         """
         return PackedSamples(
             self.ray[begin:end] - first,
@@ -52,7 +52,7 @@ class PackedSamples:
 
 @dataclass(frozen=True)
 class Span:
-    """Distances between which each ray may meet something, in object radii; none where near > far."""
+    """Distances, in object radii, between which each ray may meet something; it meets nothing where near > far."""
 
     near: Float[Tensor, "rays"]
     far: Float[Tensor, "rays"]
@@ -81,7 +81,7 @@ def alpha_from_sigma(
 def sum_rays(
     values: Float[Tensor, "samples channels"], samples: PackedSamples
 ) -> Float[Tensor, "rays channels"]:
-    """Sum each ray's samples; rays without samples give zero."""
+    """Sum the values of each ray's samples; 0 for rays without samples."""
     running = torch.nn.functional.pad(_running(values.double()), (0, 0, 1, 0))
     ends = running.index_select(0, samples.starts)
     return (ends[1:] - ends[:-1]).to(values.dtype)
@@ -126,8 +126,8 @@ def composite_with_tangents(
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
     """Compute ``composite`` as RGBA, and its derivatives for densities and colours that change at the given rates.
 
-    Rates beyond the m rates of density change only colour, and their derivative of opacity is exactly 0. With
-    tau = sigma delta and D its exclusive sum along the ray, the weight T alpha changes at
+    Rates beyond the m rates of density change only colour; their derivatives of opacity are exactly 0. With
+    tau = sigma delta and D its exclusive sum along the ray, the weight T alpha changes at the rate
     T (exp(-tau) tau' - alpha D'). Distances and widths are constants.
     """
     depth, weights, passed = _passage(sigma, samples)
@@ -155,11 +155,12 @@ def composite_with_gradient(
 ]:
     """Compute ``composite`` as RGBA, and its derivatives.
 
-    The derivatives are those with respect to a shift of all samples of a ray along x, y or z; to such a shift in
-    proportion to the samples' distances; and, for colour, to the q = n - 3 rates that change only colour. The first
-    three rates are spatial; the densities of the others are ignored. A sample's density adds its own colour, as far as
-    light passes through the sample, and removes everything behind it: with tau = sigma delta, the pixel C changes by
-    T exp(-tau) c - sum_{j behind} w_j c_j.
+    The first three rates are the derivatives by x, y and z. The other q = n - 3 change only colour; their densities, if
+    any, are ignored. The derivatives returned are, in order: by a shift of all samples of a ray along x, y or z; by
+    such a shift in proportion to the samples' distances; and, of colour alone, by the q other rates.
+
+    Density adds a sample's own colour, as far as light passes through the sample, and hides what is behind it: with
+    tau = sigma delta, the pixel's derivative by tau is T exp(-tau) c - sum_{j behind} w_j c_j.
     """
     depth, weights, passed = _passage(sigma, samples)
     weights = weights[:, None]
@@ -186,7 +187,7 @@ def composite_with_gradient(
 def _passage(
     sigma: Float[Tensor, "samples"], samples: PackedSamples
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"], Float[Tensor, "samples"]]:
-    """Return every sample's optical depth, its weight, and the light that passes it."""
+    """Return every sample's optical depth, its weight, and the transmittance behind it."""
     depth, reached = sigma * samples.width, transmittance(sigma, samples)
     return depth, reached * alpha_from_sigma(sigma, samples.width), reached * torch.exp(-depth)
 
@@ -196,7 +197,7 @@ def _segment_sum(
     samples: PackedSamples,
     factors: Float[Tensor, "samples"] | None = None,
 ) -> Float[Tensor, "rays channels"]:
-    """Return each ray's sum, in the values' own dtype; not differentiable."""
+    """Return each ray's sum, in the values' own dtype, where no derivative is needed."""
     every = torch.arange(len(values), device=values.device)
     return torch.nn.functional.embedding_bag(
         every, values, samples.starts[:-1], per_sample_weights=factors, mode="sum"
@@ -207,6 +208,6 @@ def _exclusive(values: Float[Tensor, "samples"], samples: PackedSamples) -> Floa
     """Return the sum of the values before each sample along its ray."""
     wide = values.double()
     exclusive = wide.cumsum(0) - wide
-    # A sentinel keeps the start of a last ray without samples inside the array; its value is never used.
+    # Padding keeps the start of a last ray without samples inside the array; its value is never used.
     at_start = torch.nn.functional.pad(exclusive, (0, 1)).index_select(0, samples.starts[:-1])
     return (exclusive - at_start.index_select(0, samples.ray)).to(values.dtype)

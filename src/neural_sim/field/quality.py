@@ -17,8 +17,8 @@ from neural_sim.field.scores import fit_codes, render_lit, where_known
 from neural_sim.types import PosedViews
 
 POOR = 18.0
-"""PSNR in dB on the object below which a field does not show it: debris of real captures had 11 to 14 dB, recognisable
-objects 20 and more."""
+"""PSNR in dB on the object's pixels below which a field does not show the object: fields of real captures had 11 to
+14 dB if they were debris, 20 and more if the object was recognisable."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Quality:
     Args:
         psnr: PSNR in dB on the object's pixels of the held-out views; None if there are no such views.
         ssim: SSIM on these pixels of the views that are shown.
-        cells: number of a grid's cells; None for other fields.
+        cells: number of a grid's occupied cells; None for other fields.
         views: held-out views over white, their masks and the field's renders of them, as bytes.
         photographs: whole photographs of these views, with everything but the object dimmed; empty for a mesh.
-        bins: the object from the middle of every bin, by factor.
+        bins: renders of the object from the middle of every bin, by factor.
         placed: the object's place, if it comes from photographs.
     """
 
@@ -57,7 +57,7 @@ class Quality:
 
 
 def as_views(field: RadianceField, views: PosedViews) -> Float[Tensor, "n h w 4"]:
-    """Render premultiplied images from the views' cameras; a field with lights gets a light fitted to each view."""
+    """Render premultiplied images from the views' cameras, under a code fitted to each view if the field has codes."""
     if not len(views):
         return views.images
     if isinstance(field, AppearanceField):
@@ -70,7 +70,7 @@ def as_views(field: RadianceField, views: PosedViews) -> Float[Tensor, "n h w 4"
 def similarity(
     rendered: Float[Tensor, "n h w 3"], truth: Float[Tensor, "n h w 3"], inside: Bool[Tensor, "n h w"]
 ) -> float | None:
-    """Return the mean of the similarity map over the object's pixels; None if no pixel shows it."""
+    """Return the mean of the SSIM map over the object's pixels; None if no pixel shows it."""
     if not bool(inside.any()):
         return None
     every = structural_similarity_index_measure(

@@ -44,7 +44,7 @@ class FieldRecipe:
         field: makes a new field.
         fitting: makes the fitting of a field.
         steps: budget of optimiser steps.
-        final_rate: final learning rates as a fraction of the initial ones, from which they fall exponentially.
+        final_rate: final learning rates as a fraction of the initial ones; they fall exponentially.
         score_every: number of steps between scores on the held-out views; 0: only at the end.
         seed: seed of new weights and the order of rays; separate from the run's seed, so that runs share fields.
     """
@@ -65,7 +65,7 @@ class FieldRecipe:
     def fit(
         self, views: PosedViews, held_out: int, device: torch.device, checkpoint: Checkpoint | None = None
     ) -> tuple[RadianceField, list[dict[str, Any]]]:
-        """Return the fitted field, and its scores on the last ``held_out`` views against steps and seconds.
+        """Return the fitted field, and its scores on the last ``held_out`` views with their steps and seconds.
 
         The fit resumes from ``checkpoint`` where an earlier run left off.
         """
@@ -93,8 +93,10 @@ def fit_field(
 ) -> tuple[RadianceField, list[dict[str, float]]]:
     """Fit ``fitting.field`` to all but the last ``held_out`` views, which score it (see ``RadianceFieldModule``).
 
-    Returns the field, in evaluation mode and without gradients, and its history. Raises ValueError if no view is
-    left to fit.
+    Returns the field, in evaluation mode and without gradients, and its history.
+
+    Raises:
+        ValueError: no view is left to fit.
     """
     if not 0 <= held_out < len(views):
         raise ValueError(
@@ -116,7 +118,11 @@ def fit_field(
 
 
 def field_state(field: RadianceField) -> dict[str, Any]:
-    """Return the kind, constructor arguments and tensors (on the CPU) of a field; ValueError for an unknown kind."""
+    """Return the kind, constructor arguments and tensors (on the CPU) of a field.
+
+    Raises:
+        ValueError: an unknown kind.
+    """
     kind = type(field).__name__
     if kind not in KINDS:
         raise ValueError(f"field: unknown kind {kind!r}, want one of {sorted(KINDS)}")
@@ -125,7 +131,11 @@ def field_state(field: RadianceField) -> dict[str, Any]:
 
 
 def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
-    """Rebuild a field, in evaluation mode, from its ``field_state``. Raises ``ValueError`` for an unknown kind."""
+    """Rebuild a field, in evaluation mode, from its ``field_state``.
+
+    Raises:
+        ValueError: an unknown kind.
+    """
     if saved.get("kind") not in KINDS:
         raise ValueError(f"field: unknown kind {saved.get('kind')!r}, want one of {sorted(KINDS)}")
     field = KINDS[saved["kind"]](**saved["settings"])
@@ -193,7 +203,7 @@ class RadianceFieldModule(lightning.LightningModule):
         }
 
     def train_dataloader(self) -> DataLoader[int]:
-        """Count the steps that are left; they need no data."""
+        """Return a loader that only counts the steps that are left, which need no data."""
         left = range(self._steps_done, self.steps)
         return DataLoader(left, batch_size=None)  # pyright: ignore[reportArgumentType]
 
@@ -223,7 +233,7 @@ class RadianceFieldModule(lightning.LightningModule):
         last = self._steps_done == self.steps
         if last and not math.isfinite(float(loss.detach())):
             raise ValueError(
-                f"field: its loss is {float(loss.detach())} after {self.steps} steps: want smaller learning rates "
+                f"field: the loss is {float(loss.detach())} after {self.steps} steps: want smaller learning rates "
                 "(field.fitting.learning_rate and those of its parts)"
             )
         if last or (self.score_every and self._steps_done % self.score_every == 0):

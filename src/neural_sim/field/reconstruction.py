@@ -1,7 +1,7 @@
 """A coloured mesh of an object from its posed views: marching cubes of the masks, colours from the views.
 
-`+experiment=sfm_vs_nerf` compares fields with it. Its geometry comes from silhouettes (Laurentini 1994) and not from a
-structure-from-motion pipeline, which needs features that smooth objects lack.
+`+experiment=sfm_vs_nerf` compares fields with it. Its geometry comes from silhouettes (Laurentini 1994), not from
+structure from motion, which needs features that smooth objects lack.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from neural_sim.types import PosedViews
 LEVEL = 0.5
 """Alpha of the silhouette's edge."""
 GRAZING = 0.2
-"""Smallest cosine between a surface's normal and a view's direction at which the view colours the surface."""
+"""Smallest cosine between a surface's normal and the direction to a camera at which its view colours the surface."""
 SHARPNESS = 4.0
-"""Power of that cosine in the views' weights: frontal views see most detail."""
+"""Power of that cosine in the views' weights: frontal views show most detail."""
 LIFT = 0.02
 """Height in object radii above the surface at which the ray to a camera begins."""
 
@@ -32,7 +32,7 @@ LIFT = 0.02
 def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
     """Return the surface where the least alpha over all views is ``LEVEL``, with a colour at each vertex.
 
-    It is in the views' frame and unlit: the colours are those of the views, with the light that was on them.
+    It is in the views' frame. Its colours are those of the views, including their light, so it is to be drawn unlit.
     ``resolution`` is that of ``visual_hull``; the alphas are sampled at the centres of its cells. A photograph does not
     carve cells that it does not show.
 
@@ -52,7 +52,7 @@ def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
 
     vertices, faces, _, _ = marching_cubes(padded, LEVEL, spacing=(cell,) * 3)
     vertices += origin.cpu().double().numpy() - 0.5 * cell  # centre of the padding's first cell
-    # Alpha falls from the inside out, so that the surface must be reversed for its normals to point outwards.
+    # Alpha is larger inside, so the faces may be wound inwards; normals must point outwards.
     mesh = trimesh.Trimesh(vertices, faces, process=True)
     if mesh.volume < 0.0:
         mesh.invert()

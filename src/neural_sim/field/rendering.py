@@ -1,4 +1,4 @@
-"""From rays to pixels through any field: sample, query, composite. Training and rendering share this code."""
+"""From rays to pixels through any field: sample, query, composite; with derivatives, and for whole views."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from neural_sim.field.quadrature import (
 from neural_sim.types import PinholeCamera, Rays
 
 FEW = 2
-"""Up to this many rates are propagated through the samples; for more, the derivatives by a ray's six numbers are."""
+"""Largest number of rates propagated one by one through the samples; more share derivatives by origin and direction."""
 SAMPLES_AT_ONCE = 16_384
-"""Number of samples differentiated together on a CPU, to fit its cache."""
+"""Number of samples that are differentiated together on a CPU, so that they fit its cache."""
 
 
 def render_samples(
@@ -52,7 +52,7 @@ def render_with_tangents(
     Derivatives by a moving light (see ``RadianceField.light_rates``) follow these m.
 
     One pass over the samples, about ``samples_at_once`` at a time, gives pixels and derivatives: a sample at distance t
-    moves at o' + t d'. Many rates cost no more than a few (``_by_ray_numbers``).
+    moves at o' + t d'. Many rates cost little more than a few (see ``_by_ray_numbers``).
     """
     samples = field.sample(rays, termination)
     differentiate = _with_tangents if len(rates.origins) <= FEW else _by_ray_numbers
@@ -118,8 +118,8 @@ def render_views(
 ) -> Float[Tensor, "views height width channels"]:
     """Render premultiplied RGBA of whole views; chunks bound the memory and may span views.
 
-    ``cull`` casts rays only for pixels that may see something; for ``skip_empty`` see ``RadianceField.trace``. With
-    ``surfaces`` a fifth channel has the distance along the ray at which half of the light is lost (0: nowhere).
+    ``cull`` casts rays only for pixels that may see something; for ``skip_empty``, see ``RadianceField.trace``. With
+    ``surfaces``, a fifth channel has the distance along the ray at which half of the light is lost (0: nowhere).
     """
     shape = (len(camera_to_world), camera.height, camera.width, 4 + surfaces)
     image = camera_to_world.new_zeros(shape).view(-1, shape[-1])

@@ -1,7 +1,4 @@
-"""Scores of a field on views: the error that fitting minimises, and image metrics on held-out views.
-
-A field with appearance codes is scored on each view under a code fitted to the view's left half.
-"""
+"""Scores of a field on views: the error that fitting minimises, and image metrics on held-out views."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ Rendering = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]
 
 
 def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, ""]:
-    """Compute the mean squared colour error over a background drawn uniformly in [0, 1], in closed form.
+    """Compute the mean squared colour error over a random background, uniform in [0, 1], in closed form.
 
     With d the error of premultiplied colour, a that of opacity and b the background, the pixel's error is d - a b;
     E b = 1/2 and E b^2 = 1/3. ``pixels`` are premultiplied RGBA.
@@ -48,7 +45,7 @@ def score_views(
 def where_known(
     rendered: Float[Tensor, "views height width 4"], views: PosedViews
 ) -> Float[Tensor, "views height width 4"]:
-    """Return renders without the pixels that these views do not show."""
+    """Return the renders, with 0 at pixels that the views do not show."""
     return rendered if views.known is None else rendered * views.known[..., None]
 
 
@@ -57,9 +54,8 @@ def compare(
 ) -> dict[str, float]:
     """Score premultiplied renders against views over white.
 
-    The scores are ``psnr``, ``ssim``, and ``psnr_foreground``, the PSNR where alpha is above 0.
-
-    PSNR is in dB, averaged over views; SSIM is torchmetrics' default (Gaussian window, range 1).
+    The scores are ``psnr``, ``psnr_foreground`` (where a view's alpha is above 0) and ``ssim``. PSNR is in dB, averaged
+    over views; SSIM is torchmetrics' default (Gaussian window, range 1).
     """
     shown, target = (
         over_white(image).movedim(-1, 1).clamp(0.0, 1.0) for image in (rendered, premultiplied(images))

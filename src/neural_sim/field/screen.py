@@ -14,7 +14,7 @@ from neural_sim.field.occupancy import COARSENING, Occupancy
 from neural_sim.types import PinholeCamera
 
 BLOCKS = 4
-"""Largest number of pixel blocks that a ball may cover to each side; larger blocks would let rays pass far from it."""
+"""Least number of pixel blocks that a large ball covers to each side: larger blocks would include rays far from it."""
 
 
 def coarse_centres(occupancy: Occupancy) -> tuple[Float[Tensor, "3 cells"], float]:
@@ -34,17 +34,17 @@ def screen_span(
 ) -> Span:
     """Return distances between which rays of the image's ``rows`` can meet balls of ``radius`` around ``centres``.
 
-    The interval is never too narrow; near > far if a pixel sees no ball. Each ball is drawn as one block of pixels,
-    with its nearest and farthest distance; all are then widened by as many blocks as the largest ball covers. Blocks
-    grow with the balls, so that a large image needs no more memory than a small one. If a ball touches the camera
-    plane, nothing is known, and every pixel gets all distances.
+    The interval is never too narrow; near > far if a pixel sees no ball. Each ball is drawn as the block of pixels at
+    its centre, with its nearest and farthest distance; all are then widened by as many blocks as the largest ball
+    covers to each side. Blocks grow with the balls, so that a large image needs no more memory than a small one. If a
+    ball touches the camera plane or covers more than the image, every pixel gets all distances.
     """
     rotation, position = camera_to_world[:3, :3], camera_to_world[:3, 3]
     x, y, z = (rotation.t() @ (centres - position[:, None])).unbind(0)
     size = (len(rows), camera.width)
-    # A margin for the rounding errors here, far below a step.
+    # A margin for rounding errors, far smaller than a step.
     radius = radius * (1.0 + 1e-4)
-    # A point of the ball lies at (x + u) / (-z + w), |u|, |w| <= radius: off the centre by at most this slope.
+    # A point of the ball projects to (x + u) / (-z + w), |u|, |w| <= radius: off the centre by at most this slope.
     across, down = x / -z, -y / -z
     slope = radius * (1.0 + torch.maximum(across.abs(), down.abs())) / (-z - radius)
     ahead, largest = torch.stack([(-z > 1.01 * radius).all().to(slope.dtype), slope.amax()]).tolist()
@@ -73,7 +73,7 @@ def screen_span(
 
 
 def _sliding_max(values: Float[Tensor, "2 h w"], axis: int, width: int) -> Float[Tensor, "2 h2 w2"]:
-    """Return the largest of every ``width`` neighbours along an axis, in windows that double (faster than pooling)."""
+    """Return the largest of every ``width`` neighbours along an axis, by doubling windows (faster than pooling)."""
     window = 1
     while 2 * window <= width:
         values = _larger(values, axis, window)

@@ -17,7 +17,7 @@ SMALLEST_BETA = 0.03  # as in NeRF in the Wild
 class TransientHead(nn.Module):
     """Predicts density, colour and uncertainty of what only one view shows, from a position and the view's code.
 
-    It is used while fitting and dropped afterwards; ``codes`` has 16 numbers per view, as in NeRF in the Wild.
+    It is used in fitting and dropped afterwards; ``codes`` has 16 numbers per view, as in NeRF in the Wild.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class TransientHead(nn.Module):
         self.initial_density = initial_density
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw new codes. Equal codes would stay equal if their views had equal gradients."""
+        """Draw new codes at random, because equal codes would stay equal under equal gradients."""
         drawn = torch.randn(self.codes.shape, generator=generator, device=generator.device)
         with torch.no_grad():
             self.codes.copy_(drawn)
@@ -55,7 +55,7 @@ def composite_both(
     transient: tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"], Float[Tensor, "samples"]],
     samples: PackedSamples,
 ) -> tuple[Rendering, Float[Tensor, "rays"]]:
-    """Composite object and transients together; return the image and each ray's beta, seen through both.
+    """Composite object and transients together; return the image, and each ray's beta as seen through both.
 
     Densities add up and colours mix by density, as for two media that emit and absorb in the same place. (NeRF in the
     Wild adds the two alphas, whose sum exceeds 1 where both are opaque.)

@@ -127,7 +127,7 @@ def test_a_box_says_which(capture):
         ),
         (
             ((0.4, 0.4, 0.4), (0.6, 0.6, 0.6)),
-            r"objects\.box: nothing of thing is in .*0\.4.*want two corners about the object.*capture\.json",
+            r"objects\.box: nothing of thing is in .*0\.4.*want two corners around the object.*capture\.json",
         ),
     ],
 )

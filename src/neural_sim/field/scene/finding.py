@@ -21,18 +21,18 @@ from neural_sim.objects.pictures import Corners
 RAYS = 98_304
 """Number of pixels whose rays find the scene's surface."""
 DETAILED = 3
-"""One in this many of these pixels, those with most detail, gives a point among which the plane is searched."""
+"""One in this many of the surface's points, those of the pixels with most detail, are searched for the plane."""
 FAINT = 0.05
-"""Largest contribution to any pixel of the contents of a box that counts as empty."""
+"""A box counts as empty if no cell in it contributes more than this to any pixel."""
 THICK = 0.75
-"""Largest distance in cells from the plane of points on it: a fitted surface is about that thick."""
+"""Distance in cells within which a point counts as on the plane: a fitted surface is about that thick."""
 
 
 @dataclass(frozen=True)
 class Found:
     """The object's region in the normalised frame, and its place in the capture's.
 
-    Centre, radius and box are in the capture's frame. ``occupied`` marks the field's cells without fog.
+    ``centre``, ``radius`` and ``box`` are in the capture's frame. ``occupied`` marks the field's cells without fog.
     """
 
     frame: Frame
@@ -80,7 +80,7 @@ def find(
         if region is None:
             raise ValueError(
                 f"objects.box: nothing of {capture.name} is in {[list(corner) for corner in box]}; want two corners "
-                f"about the object, in the frame and the unit of {capture.source}"
+                f"around the object, in the frame and the unit of {capture.source}"
             )
     else:
         within = None
@@ -90,7 +90,7 @@ def find(
         if region is None:
             raise ValueError(
                 f"{capture.source}: objects.masks=scene finds no object of {capture.name} near ({middle}), where the "
-                "cameras look; set objects.box to two corners about it, or give masks"
+                "cameras look; set objects.box to two corners around it, or give masks"
             )
     low, high = (frame.out(corner) for corner in region.corners())
     centre = 0.5 * (low + high)
@@ -103,10 +103,10 @@ def find(
 def _boxed(
     grid: SceneGrid, largest: Float[Tensor, "cells"], plane: Plane | None, frame: Frame, box: Corners
 ) -> Region | None:
-    """Find everything in the box above the plane, if the plane crosses its lower half; None if nothing is solid."""
+    """Find everything in the box above the plane, if that is below the box's centre; None if nothing is solid."""
     low, high = (frame.into(torch.tensor(corner)) for corner in box)
     if plane is not None and float(plane.height(0.5 * (low + high))) < 0.0:
-        plane = None  # the box's centre is below it, so the object does not stand on it
+        plane = None  # the box's centre is below it, so it cannot support the object
     centres = expand(cell_centres(grid.resolution))
     inside: Bool[Tensor, "cells"] = ((centres > low) & (centres < high)).all(-1)
     region = Region(inside, grid.resolution, plane, GROUND * grid.edge)

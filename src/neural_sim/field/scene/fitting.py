@@ -16,14 +16,14 @@ from neural_sim.types import Rays
 
 LEARNING_RATE = 0.2
 WARM_RATE = 0.1
-"""Learning rate of a warm start, low enough to keep what is settled, such as a table without texture."""
+"""Learning rate of a warm start, low enough to keep what the first fit settled, such as a plain table top."""
 FINAL_RATE = 0.1
 GAIN_RATE = 0.01
 """Learning rate of the photographs' log gains."""
 SMOOTHNESS = 0.01
 """Weight of the absorbed fractions' total variation in the loss."""
 SMOOTHED = 16_384
-"""Number of vertices at which each step evaluates it."""
+"""Number of vertices at which each step evaluates the total variation."""
 REACHED = 1e-3
 """Transmittance below which samples are dropped."""
 MARK_EVERY = 16
@@ -93,8 +93,8 @@ def loss_of(
 ) -> Float[Tensor, ""]:
     """Compute the mean squared error of colours, plus ``SMOOTHNESS`` times the total variation at some vertices.
 
-    Each photograph has its own exposure, a factor exp(log_gain). Light that passes the whole scene shows the colour
-    ``behind``, which is drawn at random in every step and so teaches the field to be opaque.
+    Each photograph has its own exposure, a factor exp(log_gain). Rays that pass the whole scene show the colour
+    ``behind``; it is drawn at random in every step, which teaches the field to be opaque.
     """
     raw = grid.raw(seen.corners, seen.weights)
     weights = render_weights(grid.density(raw[:, 0]), seen.samples)
@@ -109,7 +109,7 @@ def loss_of(
 class Budget:
     """The budget of one fit: ``steps`` of ``batch_rays`` rays, and the final number of cells per side.
 
-    The number of cells per side doubles to this after a third of the steps.
+    The number of cells per side doubles to ``resolution`` after a third of the steps.
     """
 
     steps: int
@@ -156,9 +156,8 @@ def fit(
         )
         seen = visible(grid, pixels.rays(index, frame), phase, grid.samples)
         vertices = torch.randint(len(grid.table), (SMOOTHED,), generator=generator)
-        centred = log_gain - log_gain.mean(
-            0
-        )  # a factor common to all photographs is the field's own brightness
+        # A factor common to all photographs is the field's own brightness.
+        centred = log_gain - log_gain.mean(0)
         loss = loss_of(grid, seen, pixels.colours[index], centred[pixels.photo[index]], behind, vertices)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()

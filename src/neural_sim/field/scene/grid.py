@@ -11,13 +11,13 @@ from neural_sim.field.interpolation import CORNERS, corner_weights, gather_weigh
 from neural_sim.field.scene.space import Frame, cells_of, contract, expand
 
 INITIAL = -5.0
-"""Argument of softplus in a new grid: rays pass through and lose about a third of their light."""
+"""Argument of softplus in a new grid, low enough that most light passes through the scene."""
 GAIN = 2.0
 """Factor by which density learns faster than colour."""
 AT_ONCE = 1 << 17
-"""Number of vertices that are moved together."""
+"""Number of vertices that are resampled at once."""
 EMPTY = 1e-3
-"""Largest fraction absorbed over a cell's edge that counts as empty."""
+"""Largest fraction of light that an empty cell absorbs over the length of its edge."""
 
 
 class SceneGrid:
@@ -71,14 +71,14 @@ class SceneGrid:
         return functional.softplus(GAIN * raw) / self.edge
 
     def in_occupied(self, contracted: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-        """Tell whether points lie in cells that ``mark`` has kept."""
+        """Tell whether points lie in occupied cells."""
         return self.occupied[cells_of(contracted, self.resolution)]
 
     def variation(self, vertices: Int[Tensor, "some"]) -> Float[Tensor, ""]:
-        """Compute the total variation of the absorbed fraction of a cell's edge.
+        """Compute the total variation, at these vertices, of the fraction of light absorbed over a cell's edge.
 
-        It is the mean length of the differences to the next vertex along each axis. It is lowest for the smoothest of
-        all surfaces that explain the photographs equally well.
+        It is the mean norm of a vertex's differences from its next neighbours along the three axes. Among surfaces that
+        explain the photographs equally well, the smoothest has the least.
         """
         side = self.resolution + 1
         last = len(self.table) - 1
@@ -99,7 +99,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def moved(self, old: Frame, new: Frame) -> SceneGrid:
-        """Resample the field from the frame ``old`` onto a grid with as many cells in the frame ``new``."""
+        """Resample the field from the frame ``old`` onto a grid of the same resolution in the frame ``new``."""
         side = self.resolution + 1
         axis = torch.linspace(-2.0, 2.0, side)
         vertices = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3)
@@ -110,7 +110,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def refined(self) -> SceneGrid:
-        """Resample the field onto twice as many cells per side; absorbed fractions halve with the edge."""
+        """Resample the field onto twice as many cells per side, each of which absorbs as much as an old one did."""
         side, finer = self.resolution + 1, 2 * self.resolution + 1
         values = self.table.detach().view(side, side, side, 4).permute(3, 0, 1, 2)[None]
         table = functional.interpolate(values, (finer, finer, finer), mode="trilinear", align_corners=True)

@@ -1,4 +1,4 @@
-"""Read photographs as pixels with rays: they are reduced, and the rays undo the lens distortion."""
+"""Read photographs, reduced, as pixels with rays that undo the lens distortion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neural_sim.objects.pictures import reduced
 
 @dataclass(frozen=True)
 class PhotoRays:
-    """Rays of a reduced photograph's pixels, in the capture's frame; ``seen`` marks pixels for which there is a ray."""
+    """Rays of a reduced photograph's pixels, in the capture's frame; ``seen`` marks the pixels that have a ray."""
 
     origin: Float[Tensor, "3"]
     directions: Float[Tensor, "h w 3"]

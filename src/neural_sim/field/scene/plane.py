@@ -12,14 +12,14 @@ from torch import Tensor
 from neural_sim.field.scene.space import Frame
 
 NEARBY = 1.0
-"""Radius of the ball whose points are used, in the normalised frame."""
+"""Radius, in the normalised frame, of the ball whose points are searched for a plane."""
 AROUND = 2.0
-"""The same radius if the object fills the unit ball."""
+"""Radius of the ball whose points a known plane is refitted to; the object then fills the unit ball."""
 HYPOTHESES = 1024
 TILT = math.radians(40.0)
-"""Largest angle between a plane's normal and up: cameras on one side of an object see it from above."""
+"""Largest angle between a plane's normal and up, which is only rough if it is the mean of the cameras' up vectors."""
 LIKELY = math.radians(15.0)
-"""Standard deviation of that angle: of planes with equally many points, the more upright one wins."""
+"""Standard deviation of that angle: among planes with equally many points, the one with the smaller angle wins."""
 PART = 0.08
 """Smallest fraction of the nearby points that must lie on a supporting plane."""
 STANDING = 0.02
@@ -27,12 +27,12 @@ STANDING = 0.02
 CAMERAS = 0.9
 """Smallest fraction of the cameras that must be above a supporting plane."""
 SHOWING = 0.5
-"""Most points just below a supporting plane, relative to those on it; a plane that cuts an object has as many."""
+"""Most points just below a supporting plane, relative to those on it: a plane through an object has more."""
 ATTEMPTS = 4
 JUST = 4.0
-"""End, in tolerances, of the band below a plane (from 1) whose points are evidence against it: support is opaque."""
+"""Points 1 to this many tolerances below a plane are evidence against it, because a support is opaque."""
 BELOW = 4.0
-"""Weight of points below the plane: surfaces without texture bulge towards the cameras, never away from them."""
+"""Weight of points below the plane in its fit: surfaces without texture bulge towards the cameras, never away."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Plane:
     offset: float
 
     def from_axis(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Return the distances from the line along the plane's normal through the origin."""
+        """Return the points' distances from the line through the origin along the plane's normal."""
         normal = points.new_tensor(self.normal)
         return (points - (points @ normal)[..., None] * normal).norm(dim=-1)
 
@@ -67,9 +67,9 @@ def supporting_plane(
     """Find the plane below the object at the origin; None if there is none. All inputs are in the normalised frame.
 
     RANSAC (Fischler and Bolles 1981) finds, from random samples of three points, the plane with most points within
-    ``tolerance`` and few just below it, which is then fitted by least squares. There must be cameras above it and
-    something standing on it near the origin, and it must extend farther than that; the top of a box or the foot of a
-    lamp does not.
+    ``tolerance`` and few just below it, which is then fitted by least squares. Most cameras must be above it, and
+    something must stand on it near the origin. The plane must extend farther than what stands on it; the top of a box
+    or the foot of a lamp does not.
     """
     near = points[points.norm(dim=-1) < NEARBY].double()
     left = torch.ones(len(near), dtype=torch.bool)

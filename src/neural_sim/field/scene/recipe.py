@@ -28,11 +28,11 @@ _log = logging.getLogger(__name__)
 CAMERAS_AT = 2.0
 """Median camera distance in the first field's frame: cameras lie outside the ball that is not contracted."""
 ROOM = 1.0
-"""Radius of the ball that the second field does not contract, in radii of the object that the first found."""
+"""Radius of the ball that the second field does not contract, in radii of the object that the first field found."""
 COARSE = 0.5
-"""Steps, cells a side and pixels a side of the first field, relative to the second's."""
+"""Steps, cells per side and pixels per side of the first field, relative to the second's."""
 LEAST_PIXELS = 80
-"""Smallest number of pixels along the longer side of its photographs."""
+"""Smallest number of pixels along the longer side of the first field's photographs."""
 
 
 @validated
@@ -40,8 +40,8 @@ LEAST_PIXELS = 80
 class SceneMasks:
     """Masks from a field of the whole scene.
 
-    In a first field of half the resolution, the supporting plane is found, and on it the object that the cameras look
-    at. The second field has the object at its centre, where its cells are finest, and renders the masks.
+    A first field, of half the resolution, shows the supporting plane and on it the object that the cameras look at. The
+    second field has the object at its centre, where its cells are finest, and renders the masks.
 
     Args:
         image_size: longer side in pixels of the photographs that train the field, and of the masks.
@@ -62,9 +62,9 @@ class SceneMasks:
     ) -> tuple[Float[Tensor, "_ _"], ...]:
         """Compute the object's opacity in [0, 1] in each photograph, ``image_size`` pixels along its longer side.
 
-        ``up`` is in the capture's frame; None: its file's, or else the mean of the cameras' up vectors. With ``box``,
-        the object is everything in the box above the plane; without it, it is the connected part nearest to the point
-        that the cameras look at.
+        ``up`` is in the capture's frame; None: that of its file, or else the mean of the cameras' up vectors. With
+        ``box``, the object is everything in the box above the plane; without it, the connected part nearest to the
+        point that the cameras look at.
 
         Raises:
             ValueError: the cameras do not look at one place, no object is found, or the box is empty.
@@ -117,8 +117,8 @@ def _tell(capture: Capture, found: Found, masks: tuple[Tensor, ...]) -> None:
         normal = ", ".join(f"{x:.3f}" for x in plane.normal)
         stands = f"stands on the plane through ({place}) with normal ({normal})"
     _log.info(
-        "%s: the object %s and has the box [[%s], [%s]] in the capture's frame; it covers %.1f %% of the photographs "
-        "(%.1f to %.1f %%). objects.box sets another box",
+        "%s: the object %s and has the box [[%s], [%s]] in the capture's frame; it covers %.1f %% of a photograph "
+        "(median; %.1f to %.1f %%). objects.box sets another box",
         capture.name, stands, low, high, 100.0 * float(np.median(covered)), 100.0 * min(covered), 100.0 * max(covered),
     )  # fmt: skip
 

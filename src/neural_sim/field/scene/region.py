@@ -19,25 +19,25 @@ from neural_sim.field.scene.space import Frame, cells_of, contract, expand
 from neural_sim.field.scene.surface import SeenSurface
 
 SHOWS = 0.4
-"""Smallest contribution of a solid cell to some pixel."""
+"""A cell is solid if it contributes more than this to some pixel."""
 HITS = 2
-"""Smallest number of rays that end in a solid cell: each cell of a blurred surface contributes less."""
+"""A cell is also solid if this many rays end in it: each cell of a blurred surface contributes less."""
 REACH = 1.5
 """The object lies inside the ball of this radius in the normalised frame."""
 LARGE = 0.1
 """Connected parts with less than this fraction of the largest part's cells are errors of the field."""
 FARTHEST = 0.9
-"""Largest distance from the origin at which the end of an object is looked for."""
+"""Largest distance from the origin at which an object may end."""
 LEAST = 8
 """Smallest number of solid cells in an object."""
 EMPTIER = 0.5
-"""Largest density of solid cells around an object, relative to that of the object."""
+"""Largest density of solid cells around an object, relative to their density in the object."""
 SPECK = 64
-"""Smallest number of cells in a connected part of the scene's surface: less is an error of the field, in the air."""
+"""Smallest number of cells in a connected part of the scene's surface; smaller parts are errors of the field."""
 APART = 1.0
-"""Height in cells above the plane at which cells start to connect: lower, the plane's roughness would connect them."""
+"""Height in cells above the plane from which cells connect; lower, the plane's roughness would connect them."""
 GROUND = 1.0
-"""Height in cells above the plane at which samples start to be the object's."""
+"""Height in cells above the plane from which samples belong to the object."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def connected_region(
     plane: Plane | None,
     within: Bool[Tensor, "cells"] | None = None,
 ) -> Region | None:
-    """Find the connected part nearest to the origin; None if there is nothing.
+    """Find the connected solid part nearest to the origin; None if there is none.
 
     ``within``, if given, holds the object and little else, so that everything solid in it is taken.
     """
@@ -90,7 +90,7 @@ def connected_region(
         return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
     centres = expand(cell_centres(grid.resolution))
     distance = centres.norm(dim=-1) if plane is None else plane.from_axis(centres)
-    # With large cells or few steps, some rays also end in the air, so that a solid cell must end more of them.
+    # With large cells or few steps, some rays also end in the air, so a solid cell must end more of them.
     for least in (HITS, 2 * HITS, 4 * HITS, 8 * HITS, math.inf):
         solid = (shows | (surface.hits >= least)) & allowed
         reach = _apart(distance[solid], 3 if plane is None else 2, grid.edge)
@@ -179,7 +179,7 @@ def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None)
 
 
 def _allowed(grid: SceneGrid, plane: Plane | None, cells: float) -> Bool[Tensor, "cells"]:
-    """Find the cells within reach that are at least ``cells`` cells above the plane."""
+    """Find the cells within reach that are more than ``cells`` cells above the plane."""
     centres = expand(cell_centres(grid.resolution))
     inside = centres.norm(dim=-1) < REACH
     if plane is not None:

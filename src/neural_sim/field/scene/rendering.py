@@ -18,20 +18,20 @@ from neural_sim.field.scene.surface import AT_ONCE
 from neural_sim.types import Rays
 
 PHASES = (0.25, 0.75)
-"""Number of shifts of the sample lattice that a pixel averages: with only one, a surface shows the lattice's steps."""
+"""Shifts of the sample lattice that a pixel averages; with only one, a surface would show the lattice's steps."""
 
 PINHOLE = 0.01
 """Area of a hole, relative to that of the mask, below which it is filled."""
 FOG = 4.0
-"""Transmittance, as one over this number, above which nothing is hidden; solid things let less than 1 % pass."""
+"""Nothing is hidden where 1 / ``FOG`` or more of the light passes what is in front; solids let less than 1 % pass."""
 
 
 @torch.no_grad()
 def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) -> Float[Tensor, "h w"]:
     """Compute the object's opacity in [0, 1] at each pixel, where nothing solid in front hides it.
 
-    Fog counts as transparent: from sides with few photographs, a field explains these by something thin in the air,
-    which would otherwise hide the object.
+    Fog counts as transparent: where few photographs look, a field explains them by something thin in the air, which
+    would otherwise hide the object.
     """
     height, width = rays.seen.shape
     directions = rays.directions.reshape(-1, 3).float()
@@ -53,7 +53,7 @@ def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) 
 
 
 def without_pinholes(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Fill holes that are small for the object, as in walls that few photographs show; handles have larger ones."""
+    """Fill holes that are small for the object, as in walls that few photographs show; holes in handles are larger."""
     solid = (mask > 0.5).numpy()
     holes, count = scipy.ndimage.label(~solid)  # pyright: ignore[reportGeneralTypeIssues]
     sizes = np.bincount(holes.ravel(), minlength=count + 1)

@@ -12,10 +12,10 @@ from torch import Tensor
 from neural_sim.objects.placing import nearest_to_axes
 
 NEAR = 0.4
-"""Start of rays, as a fraction of their camera's distance from the origin: nearer, a field has room for a picture of
-its own in front of each camera, and photographs of an object show nothing there."""
+"""Start of rays, as a fraction of their camera's distance from the origin. Nearer, a field could place a separate
+picture in front of each camera, and photographs of an object show nothing there."""
 FAR = 100.0
-"""End of rays: the contraction moves anything farther by less than 1 / FAR."""
+"""End of rays: everything farther is contracted into a shell of thickness 1 / FAR."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
 
 
 def expand(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Invert ``contract``; points outside the ball of radius 2 go far away."""
+    """Invert ``contract``; points outside the ball of radius 2 are sent far away."""
     length = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
     return points / (length * (2.0 - length).clamp_min(1e-6))
 
@@ -94,7 +94,7 @@ def looked_at(camera_to_world: Float[np.ndarray, "n 4 4"], name: str) -> tuple[n
     ahead = ((point - centres) * axes).sum(1) > 0.0
     if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(axes) or ahead.mean() < 0.5:
         raise ValueError(
-            f"objects.masks=scene: the cameras of {name} do not look at one place from several sides, so that nothing "
-            "says where the object is; set objects.box"
+            f"objects.masks=scene: the cameras of {name} do not look at one place from several sides, so the "
+            "place of the object is unknown; set objects.box"
         )
     return point, float(np.median(np.linalg.norm(centres - point, axis=1)))

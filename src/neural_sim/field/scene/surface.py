@@ -45,7 +45,7 @@ def seen_surface(
         reached = transmittance(sigma, seen.samples)
         weights = reached * alpha_from_sigma(sigma, seen.samples.width)
         largest.scatter_reduce_(0, cells_of(seen.positions, grid.resolution), weights, "amax")
-        # Light falls along a ray: half of it is lost in the last sample that half of it reaches.
+        # Transmittance falls along a ray: half of the light is lost in the last sample that half of it reaches.
         lit = torch.nn.functional.pad((reached >= 0.5).long().cumsum(0), (1, 0))
         starts = seen.samples.starts
         last = starts[:-1] + lit[starts[1:]] - lit[starts[:-1]] - 1
