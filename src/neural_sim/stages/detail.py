@@ -81,7 +81,7 @@ def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[Fie
     _log.info(
         "export: images of %d x %d resolve as much as views of %d pixels a side; fields are fitted to views of %d%s",
         camera.width, camera.height, wanted, size,
-        f" (export.largest_views; each pixel covers {wanted / size:.1f} of an image's)" if size < wanted else "",
+        f" (export.largest_views; each pixel fills {wanted / size:.1f} pixels of an image)" if size < wanted else "",
     )  # fmt: skip
     if size == views.image_size:
         return graph.fields

@@ -49,7 +49,7 @@ class Graph(Images):
 
     @cached_property
     def warm_start(self) -> DetectorStage:
-        """The detector whose backbone every training of the psi loop starts from.
+        """The detector whose backbone the trainings of the psi loop use.
 
         If it is trained on the initial distribution, for as many epochs as scored detectors, and these are not
         fine-tuned, it is also the detector scored as ``ns``.
@@ -92,7 +92,7 @@ class Graph(Images):
         )  # fmt: skip
 
     def _on_photographs(self, start: DetectorStage | None) -> PhotographsStage:
-        """Return ``start`` fine-tuned on photographs; None: a detector trained on them alone, for as many steps."""
+        """Return ``start`` fine-tuned on photographs; if None, a detector trained on them alone, as long as on images."""
         x, training, real = self.experiment, self._training, self._training.real
         steps = -(-training.images_per_object * len(self.names) // training.batch_size)
         epochs = training.cold_epochs

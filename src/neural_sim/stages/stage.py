@@ -25,7 +25,7 @@ UNKEYED = {"key": False}
 
 
 class Stage(ABC, Generic[T]):
-    """One step of a run, as a frozen dataclass. Fields that are stages, or tuples of them, are inputs; others settings.
+    """One step of a run: a frozen dataclass whose fields are inputs (stages, or tuples of stages) and settings.
 
     The key of the result covers the settings, the keys of the inputs, and the version of all code imported by the
     modules of the stage and its settings. Fields whose metadata is ``UNKEYED`` are left out: they only affect speed and
@@ -114,7 +114,7 @@ class Stage(ABC, Generic[T]):
 
 
 class Results:
-    """Evaluates stages: takes a result from memory, reads it from the store, or makes it and stores it.
+    """Evaluates stages: takes a result from memory, reads it from the store, or makes it.
 
     Args:
         store: store of results.
@@ -168,7 +168,7 @@ class Results:
         )
 
     def free_first(self, stages: Iterable[Stage[T]]) -> Iterator[Stage[T]]:
-        """Yield the stages, leaving those that another run is making now for last, when they may be finished.
+        """Yield the stages, leaving for last those that another run is making, which may be finished by then.
 
         Runs that start together thus share the work instead of all waiting for the same result.
         """
@@ -206,7 +206,7 @@ class Results:
         """Raise now the errors that evaluating the stages might otherwise raise after minutes of other work.
 
         Returns:
-            The stages that would be computed, see ``missing``. Early stages have been made already.
+            The stages that would be computed, see ``missing``. Early ones among them have been made already.
 
         Raises:
             ValueError: as evaluating the stages does.

@@ -1,4 +1,4 @@
-"""The version of the code that a result depends on: a digest of the source of all modules that it imports."""
+"""The version of the code that a result depends on: a digest of the source of modules and all that they import."""
 
 from __future__ import annotations
 

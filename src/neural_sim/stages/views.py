@@ -70,7 +70,7 @@ class ViewsStage(Stage[PosedViews]):
 
     @property
     def held_out(self) -> int:
-        """Number of views, the last ones, that are used only to score the field."""
+        """Number of held-out views, which come last and only serve to score the field."""
         return self.objects.held_out(self.object, self.settings)
 
     def fitted(self, results: Results) -> PosedViews:

@@ -217,7 +217,7 @@ def _take_up(left: Path, data: DataSet) -> None:
             if ours:
                 ExportFolder(left, data.identity).check()
                 shutil.move(left, data.root)
-                _log.info("export: continues the unfinished data set of %s", left)
+                _log.info("export: continues the unfinished data set moved from %s", left)
     except (OSError, ValueError) as error:
         _log.warning("export: starts again; %s is left as it is (%s)", left, error)
 

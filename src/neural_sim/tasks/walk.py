@@ -190,7 +190,7 @@ def warn_of_uncovered(graph: Graph) -> None:
             if found.missing:
                 out = bool(distribution.factor(factor).closed(name).any())
                 _log.warning(
-                    "%s: no photograph is within %.0f degrees of most poses of %d of the %d bins of parameter.%s: %s; "
+                    "%s: no photograph is within %.0f degrees of most poses in %d of the %d bins of parameter.%s: %s; "
                     "%s",
                     name, found.within_deg, len(found.missing), len(found.fractions), factor,
                     ", ".join(str(number) for number in found.missing),
