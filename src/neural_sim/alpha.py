@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def premultiplied(rgba: Float[Tensor, "*pixels 4"]) -> Float[Tensor, "*pixels 4"]:
-    """Multiply the colours of straight RGBA, as views have it, by alpha, as renders have it and averaging needs it."""
+    """Convert straight alpha, as views have it, to premultiplied alpha, which renders have and averages need."""
     alpha = rgba[..., 3:]
     return torch.cat([rgba[..., :3] * alpha, alpha], -1)
 

@@ -91,7 +91,7 @@ def reframed(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 
 def cropped(camera: PinholeCamera, left: int, top: int, width: int, height: int) -> PinholeCamera:
-    """Make the camera of a crop of this camera's images, which may reach beyond them; ``left``, ``top`` in pixels."""
+    """Make the camera of a crop of this camera's images, in pixels; the crop may reach beyond the images."""
     x, y = principal_point(camera)
     angle = 2.0 * math.atan(0.5 * height / focal_length(camera))
     return PinholeCamera(width, height, angle, camera.aspect, (x - left, y - top))

@@ -28,7 +28,7 @@ class Checkpoint:
     def offer(self, state: Callable[[], State | None]) -> None:
         """Write what ``state`` returns, if enough time has passed since the last write.
 
-        It returns None while the work cannot be resumed from where it is; the next call tries again.
+        ``state`` returns None while the work cannot be resumed from its present point; the next call tries again.
         """
         if time.monotonic() - self._written < self._every:
             return

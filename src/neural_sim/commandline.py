@@ -16,7 +16,7 @@ from neural_sim.configuration import UserError, first_line
 from neural_sim.extras import require
 
 OWN_WORDS = ("--config-name", "-cn", "--config-path", "-cp", "--shell-completion", "-sc", "--hydra-help")
-"""Flags that select another configuration or make the words other than settings: with them nothing is checked here."""
+"""Flags for another configuration or for Hydra itself (completion, help): with them, nothing is checked here."""
 FOLDERS = ("--config-dir", "-cd")
 PATHS = {
     "objects.root": "a folder that holds a folder for each object",
@@ -115,7 +115,7 @@ class Layout:
 
 
 def layout_of(words: Sequence[str], conf: Path) -> Layout | None:
-    """Find the files that a command reads; None if it selects another configuration or has no settings."""
+    """Find the files that a command reads; None if it has one of the flags in ``OWN_WORDS``."""
     if any(word.partition("=")[0] in OWN_WORDS for word in words):
         return None
     following = zip(words, (*words[1:], ""), strict=False)

@@ -150,7 +150,7 @@ def updated(
 
 
 def _renamed(key: str, value: str, moved: Mapping[str, str]) -> tuple[str, str] | None:
-    """Return the current key and value, or a sweep's values; None if nothing has moved."""
+    """Return the current key and value (or values, in a sweep); None if nothing has moved."""
     words = [f"{key}={one}" for one in value.split(",")]
     choices = [moved.get(word, word).partition("=") for word in words]
     names = {name for name, _, _ in choices}

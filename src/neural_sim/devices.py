@@ -1,7 +1,7 @@
 """Where a run computes: the one place that chooses a torch device, and the trainers that run on it.
 
 Draws and psi, few numbers each, are made on the CPU by CPU generators, so that a seed draws the same scenes on every
-device. Fields, images, features and targets live on the run's device; results of stages are stored from the CPU.
+device. Fields, images, features and targets live on the run's device; results are copied to the CPU to be stored.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def signals_kept() -> Iterator[None]:
-    """Restore the signal handlers that a library replaces by compiled code when it is imported inside this context.
+    """Restore the signal handlers that the import of a library inside this context replaces by compiled ones.
 
     pycolmap's logging does so: its handler of SIGTERM prints a stack trace, which can wait forever for the lock of an
     allocation that the signal interrupted.

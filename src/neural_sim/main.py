@@ -183,7 +183,7 @@ def _with_cameras(objects: Any, run: Any) -> Any:
 
 
 def _covered(distribution: Any, parameters: Mapping[str, Any], objects: Any) -> tuple[Any, Any]:
-    """Return p_psi without the bins that photographs do not cover, unless these are rendered too, and the coverage."""
+    """Return p_psi, without uncovered bins unless they are to be rendered, and which bins photographs cover."""
     from neural_sim.objects.photos import Photos
     from neural_sim.parameter.coverage import coverages
     from neural_sim.parameter.pose import Pose

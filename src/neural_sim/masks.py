@@ -113,7 +113,7 @@ def _two(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height wi
 def _several(where: str, what: str, count: int) -> str:
     return (
         f"{where}: holds {count} {what}; want a mask of one object, with two values or with opacities in grey; for "
-        "labels, set objects.mask_value to the object's"
+        "labels, set objects.mask_value to the object's label"
     )
 
 

@@ -126,7 +126,7 @@ class LabelledImages:
     def concatenate(parts: list[LabelledImages]) -> LabelledImages:
         """Join sets of equal image size; boxes are padded to the longest list among them.
 
-        If any set has a bin for each box, the result has, too: the bin of a whole image is repeated for its boxes.
+        If any set has a bin for each box, so has the result: the bin of a whole image is repeated for its boxes.
 
         Raises:
             ValueError: there are no sets.

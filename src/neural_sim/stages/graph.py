@@ -92,7 +92,7 @@ class Graph(Images):
         )  # fmt: skip
 
     def _on_photographs(self, start: DetectorStage | None) -> PhotographsStage:
-        """Return ``start`` fine-tuned on photographs; if None, a detector trained on them alone, as long as on images."""
+        """Return ``start`` fine-tuned on photographs; None: a detector trained on them alone, as long as on images."""
         x, training, real = self.experiment, self._training, self._training.real
         steps = -(-training.images_per_object * len(self.names) // training.batch_size)
         epochs = training.cold_epochs
