@@ -70,7 +70,7 @@ def interruptible() -> Iterator[None]:
         yield
     finally:
         if ending.error is not None:
-            ending.told.wait(LIMIT)
+            ending.reported.wait(LIMIT)
             _flush()
             # Without Python's own exit: with all libraries loaded it takes seconds, in which no thread runs.
             os._exit(ending.error.status)
@@ -157,7 +157,7 @@ class _Ending:
 
     def __init__(self) -> None:
         self.error: Interrupted | None = None
-        self.told = threading.Event()
+        self.reported = threading.Event()
 
     def interrupt(self, signum: int, _: FrameType | None) -> None:
         """Raise in the main thread. As a signal handler, it runs as soon as that thread executes Python code."""
@@ -175,7 +175,7 @@ class _Ending:
         error = Interrupted(signum)
         with suppress(OSError):
             os.write(2, _LINE.format(error).encode())
-        self.told.set()
+        self.reported.set()
         time.sleep(UNWINDING)
         acts = threading.Thread(target=_do_last_acts, args=(error,), daemon=True)
         acts.start()

@@ -246,11 +246,11 @@ def _instantiate(node: Any, where: str) -> Any:
         cause = error.__cause__ or error
         inner = re.search(r"^full_key: (\S+)", str(error), re.MULTILINE)
         if isinstance(cause, (ValueError, TypeError, FileNotFoundError, InstantiationException)):
-            raise UserError(_told(first_line(cause), node, where, inner[1] if inner else "")) from error
+            raise UserError(_with_key(first_line(cause), node, where, inner[1] if inner else "")) from error
         raise
 
 
-def _told(message: str, node: Mapping[str, Any], where: str, inner: str) -> str:
+def _with_key(message: str, node: Mapping[str, Any], where: str, inner: str) -> str:
     """Return a constructor's message, which may begin with ``Class.argument``, with the whole key instead."""
     made: Any = node
     for key in filter(None, inner.split(".")):

@@ -65,7 +65,7 @@ def _grey(values: np.ndarray, where: str, lossy: bool = False) -> Float[np.ndarr
         return values.astype(np.float32)
     levels = np.unique(values)
     if not lossy and len(levels) <= 2:
-        return _two(values, levels)
+        return _two_values(values, levels)
     whole = values.dtype != np.float32
     if whole and not lossy and levels[-1] < _MOST_LABELS:
         raise ValueError(_several(where, "labels", len(levels)))
@@ -100,10 +100,10 @@ def _labels(values: np.ndarray, where: str) -> Float[np.ndarray, "height width"]
     levels = np.unique(values)
     if len(levels) > 2:
         raise ValueError(_several(where, "labels", len(levels)))
-    return _two(values, levels)
+    return _two_values(values, levels)
 
 
-def _two(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height width"]:
+def _two_values(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height width"]:
     """Return 1 where a mask has the larger of its two values; a single value other than 0 is 1 everywhere."""
     if len(levels) == 1:
         return np.full(values.shape, float(levels[0] > 0), dtype=np.float32)

@@ -61,7 +61,7 @@ def say_strange(root: Path, files: Iterable[Path], suffixes: Collection[str]) ->
         path.name for path in files if path.suffix.lower() in suffixes and not _left_over(Path(path.name))
     ]
     if strange:
-        _say_once(
+        _warn_once(
             "%s: %d files such as %s have a format that is not read, and are left out",
             root,
             len(strange),
@@ -76,7 +76,7 @@ def without_leftovers(paths: Sequence[Path], root: Path) -> list[Path]:
     if len(kept) < len(paths):
         example = next(path for path in paths if _left_over(path.relative_to(root)))
         left_out = len(paths) - len(kept)
-        _say_once("%s: %d leftovers of other programs are left out, such as %s", root, left_out, example)
+        _warn_once("%s: %d leftovers of other programs are left out, such as %s", root, left_out, example)
     return kept
 
 
@@ -85,7 +85,7 @@ def _left_over(path: Path) -> bool:
 
 
 @lru_cache(maxsize=1024)  # once, however often a folder is listed or a picture is read
-def _say_once(message: str, *about: object) -> None:
+def _warn_once(message: str, *about: object) -> None:
     _log.warning(message, *about)
 
 
@@ -137,7 +137,7 @@ def read_header(path: Path, where: str = "") -> Header:
         # Phones keep a depth map as the second picture of an MPO file.
         count = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
         if count > 1:
-            _say_once("%s: holds %d pictures, the first is taken", path, count)
+            _warn_once("%s: holds %d pictures, the first is taken", path, count)
         return Header(image.size, _orientation(image), image.mode, image.format, image.has_transparency_data)
 
 
@@ -223,15 +223,15 @@ def load(path: Path | BytesIO, where: str) -> tuple[Image.Image, int]:
     """Read a picture as it is stored, and its EXIF orientation. Raises ``ValueError`` if it cannot be read."""
     with _named(where), Image.open(path) as image:
         if image.format != "PNG":
-            return _whole(image)
+            return _decoded(image)
         image.verify()  # checksums, which decoding does not check
     if isinstance(path, BytesIO):
         path.seek(0)
     with _named(where), Image.open(path) as image:
-        return _whole(image)
+        return _decoded(image)
 
 
-def _whole(image: Image.Image) -> tuple[Image.Image, int]:
+def _decoded(image: Image.Image) -> tuple[Image.Image, int]:
     orientation = _orientation(image)
     image.load()
     return image, orientation

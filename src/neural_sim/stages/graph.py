@@ -116,7 +116,7 @@ class Graph(Images):
         return replace(uniform, scene=self.scene.showing(pictures))
 
     @property
-    def _reading(self) -> LabelShift:
+    def _label_shift(self) -> LabelShift:
         x = self.experiment
         if isinstance(x.loop.method, LabelShift):
             return x.loop.method
@@ -126,12 +126,12 @@ class Graph(Images):
     def pool(self) -> PoolStage:
         """Renders of all bins, for the images of the psi loop and for the classifier of the target's boxes."""
         x = self.experiment
-        return PoolStage(self.scene, self._reading.per_bin, x.loop.outer.quality, x.run.seed)
+        return PoolStage(self.scene, self._label_shift.per_bin, x.loop.outer.quality, x.run.seed)
 
     @cached_property
     def shown(self) -> ShownStage:
         """The psi estimated from the target's boxes, with the method's settings if the method is label shift."""
-        x, settings = self.experiment, self._reading
+        x, settings = self.experiment, self._label_shift
         return ShownStage(
             self.pool, self.targets, self._symmetries, x.imaging.distribution, settings, self.psi("initial"),
             x.score == "accuracy", x.run.seed,

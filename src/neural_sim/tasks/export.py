@@ -103,7 +103,7 @@ class ExportTask(Task):
         root = context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser()
         data, distribution = self._data_set(context, root), context.experiment.imaging.distribution
         root.parent.mkdir(parents=True, exist_ok=True)
-        with locked(_lock_of(root)), self._taken_up(context, data):
+        with locked(_lock_of(root)), self._resuming(context, data):
             records = data.write(lambda numbers: context.shown(numbers, "export"))
             rows = psi_rows(distribution, data.source.psi, data.source.scene.names)
             write_whole(root / "psi.csv", psi_csv(rows))
@@ -157,7 +157,7 @@ class ExportTask(Task):
         )  # fmt: skip
 
     @contextmanager
-    def _taken_up(self, context: Context, data: DataSet) -> Iterator[None]:
+    def _resuming(self, context: Context, data: DataSet) -> Iterator[None]:
         """Resume the data set of a killed run of the same command, and note in the store where this run writes.
 
         The note is removed when the data set is finished.
@@ -169,7 +169,7 @@ class ExportTask(Task):
         store, key = Store(run.store), digest({**what, "identity": data.identity})
         state = store.state("export", key) if run.resume else None
         if state is not None and not data.root.exists():
-            _take_up(Path(state["folder"]), data)
+            _move_unfinished(Path(state["folder"]), data)
         store.keep("export", key, {"folder": str(data.root.resolve())})
         yield
         store.forget("export", key)
@@ -208,7 +208,7 @@ def _lock_of(root: Path) -> Path:
     return root.with_name(f".{root.name}")
 
 
-def _take_up(left: Path, data: DataSet) -> None:
+def _move_unfinished(left: Path, data: DataSet) -> None:
     """Move an unfinished data set to this run's folder, unless another run is working on it."""
     if not (left / MANIFEST).is_file():
         return
