@@ -52,9 +52,9 @@ class Extinction:
 
 
 class Surface:
-    """Where each of ``rays`` rays has lost half of its light: the distance in object radii of transmittance 1/2.
+    """The distance, in object radii, at which each of ``rays`` rays has lost half of its light.
 
-    ``distance`` is 0 for rays that lose less than half (opacity below 1/2). As in the quadrature, density is constant
+    It is 0 for rays that lose less than half (opacity below 1/2). As in the quadrature, density is constant
     over the length of ray that a sample represents.
     """
 

@@ -33,7 +33,7 @@ BRIDGED = 2
 """Number of cells by which parts are dilated before they are labelled, because a surface may have gaps."""
 SPREAD = 0.25
 """Factor on ``prune_weight`` for photographs. Inexact cameras and blur spread a surface over several cells, each of
-which contributes less; with the full weight, surfaces got holes."""
+which contributes less; with the full weight, surfaces had holes."""
 BATCHES_PER_BLOCK = 8
 """Number of batches whose samples are chosen at once, because each choice has a fixed cost."""
 
@@ -83,7 +83,7 @@ class GridFitting(Fitting):
         occupied, origin, cell = visual_hull(views, self.resolution >> len(self.refine_steps))
         occupied, origin = crop(occupied, origin, cell)
         self.field.reset(occupied, origin, cell)
-        # A hull cell reaches at most one diagonal beyond the silhouette, as its centre is within half of one.
+        # A hull cell reaches at most one diagonal beyond the silhouette: its centre is within half a diagonal.
         border = pixels_across(views, math.sqrt(3.0) * cell)
         self._blocks = RayBlocks(build_pool(views, border, generator))
         self._ready = []

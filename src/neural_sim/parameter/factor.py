@@ -151,7 +151,7 @@ class BinnedFactor:
         configured: initial and target distributions by object.
 
     Raises:
-        ValueError: any of these is out of its range; the message has the key and the value.
+        ValueError: an argument is out of its range; the message names its key and value.
     """
 
     update: ClassVar[str] = "update"

@@ -53,7 +53,7 @@ class Illumination:
         biased, gap: see ``ConfiguredDistributions``.
 
     Raises:
-        ValueError: any of these is out of its range; the message has the key and the value.
+        ValueError: an argument is out of its range; the message names its key and value.
     """
 
     update: ClassVar[str] = "light_update"

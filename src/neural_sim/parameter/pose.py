@@ -45,7 +45,7 @@ class Pose:
             angle a distribution; a single distribution applies to phi, and rho is uniform.
 
     Raises:
-        ValueError: any of these is out of its range; the message has the key and the value.
+        ValueError: an argument is out of its range; the message names its key and value.
     """
 
     bins: PositiveInt = 8

@@ -124,9 +124,9 @@ class Mirror:
         p = log_p.exp()
         direction = gradient / p
         direction = direction - direction.mean(-1, keepdim=True)
-        clipped = self._clipped(direction, state)
-        velocity = self.momentum * state.first + rest * clipped * direction
-        noise = self.momentum**2 * state.noise + (rest * clipped * standard_error / p).square()
+        clip = self._clip_factor(direction, state)
+        velocity = self.momentum * state.first + rest * clip * direction
+        noise = self.momentum**2 * state.noise + (rest * clip * standard_error / p).square()
         unbiased = velocity / (1 - self.momentum**steps)
         # Taken before shrinking: dividing by the shrunk norm would undo the shrinkage.
         largest = state.second.maximum(unbiased.square().mean())
@@ -136,7 +136,7 @@ class Mirror:
         moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
         return _accept(psi, moved, state, velocity, largest, noise)
 
-    def _clipped(self, direction: Float[Tensor, "objects k"], state: UpdateState) -> Float[Tensor, ""]:
+    def _clip_factor(self, direction: Float[Tensor, "objects k"], state: UpdateState) -> Float[Tensor, ""]:
         """Compute the factor that scales an outlier down to ``CLIP`` times the scale, which never decreases."""
         size, known = direction.square().mean().sqrt(), state.second.max().sqrt()
         return torch.where(

@@ -30,7 +30,7 @@ class Zoom:
         initial, target, biased, gap: see ``ConfiguredDistributions``.
 
     Raises:
-        ValueError: any of these is out of its range; the message has the key and the value.
+        ValueError: an argument is out of its range; the message names its key and value.
     """
 
     bins: PositiveInt = 4

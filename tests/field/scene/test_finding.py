@@ -123,7 +123,7 @@ def test_a_box_says_which(capture):
     [
         (
             None,
-            r"capture\.json: objects\.masks=scene finds no object of thing near \(0, 0, 0\).*set objects\.box",
+            r"capture\.json: objects\.masks=scene does not find thing near \(0, 0, 0\).*set objects\.box",
         ),
         (
             ((0.4, 0.4, 0.4), (0.6, 0.6, 0.6)),

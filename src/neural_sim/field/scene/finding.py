@@ -89,7 +89,7 @@ def find(
         region = connected_region(grid, surface, plane, within)
         if region is None:
             raise ValueError(
-                f"{capture.source}: objects.masks=scene finds no object of {capture.name} near ({middle}), where the "
+                f"{capture.source}: objects.masks=scene does not find {capture.name} near ({middle}), where the "
                 "cameras look; set objects.box to two corners around it, or give masks"
             )
     low, high = (frame.out(corner) for corner in region.corners())
