@@ -43,10 +43,10 @@ class GradientLoop(OuterLoop, ABC):
 
     One Lightning training step is one outer iteration.
 
-    With a trust region, an iteration begins with a training that accepts or rejects the last step, with the random
-    numbers of the training before that step; the last iteration does nothing else. Before the first derivative, the
-    loop tries the psi that ``first`` proposes, if any. With ``outer.refine=unread``, objects with an estimate then stay
-    where they are, unless the training rejected their step. The loop ends early if no object is left to move, after
+    With a trust region, an iteration begins by accepting or rejecting the last step, if any: it trains at the new psi
+    with the random numbers of the training before that step. The last iteration does nothing else. Before the first
+    derivative, the loop tries the psi that ``first`` proposes, if any. With ``outer.refine=unread``, objects with an
+    estimate then stay where they are, unless it was rejected. The loop ends early if no object is left to move, after
     ``outer.patience`` iterations without a step to try, or if ``outer.trust`` stops it. At the end, with
     ``steps.take_back``, every object that was free to move returns to the best psi that it has had.
     """

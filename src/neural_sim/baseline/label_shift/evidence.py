@@ -26,7 +26,7 @@ class Span:
 
     @staticmethod
     def of(p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], covered: float) -> Span:
-        """Take intervals that cover the central fraction ``covered`` of the draws from the posterior of p."""
+        """Take intervals that cover the central fraction ``covered`` of random draws of what p estimates."""
         tail = 0.5 * (1.0 - covered)
         low, high = (tuple(drawn.quantile(part, 0).tolist()) for part in (tail, 1.0 - tail))
         doubt = total_variation(drawn, p.expand_as(drawn)).mean()
