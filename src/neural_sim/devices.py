@@ -107,7 +107,7 @@ def synchronise(device: torch.device) -> None:
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
-    """Return the peak memory so far in MB, of the process and of tensors on a GPU (``peak_gpu_memory_mb``)."""
+    """Return the peaks so far in MB: ``peak_memory_mb`` of the process, ``peak_gpu_memory_mb`` of tensors on a GPU."""
     peaks = {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
     if device.type == "cuda":
         peaks["peak_gpu_memory_mb"] = torch.cuda.max_memory_allocated(device) / 2**20

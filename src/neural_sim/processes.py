@@ -33,7 +33,7 @@ class Work:
 
     Attributes:
         task: function that is called with each argument. It must be picklable; each worker receives it once.
-        folder: output folder, which every worker must see.
+        folder: folder of the results, which every worker must see.
         threads: torch threads in each worker. Results depend on it, because the order of summation does.
         gpus: fraction of a GPU that is reserved for each argument on a cluster.
     """

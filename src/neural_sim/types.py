@@ -97,8 +97,8 @@ class LabelledImages:
     """Images with boxes. Rows of ``boxes`` whose label is -1 are padding.
 
     ``images`` are in [0, 1]; ``boxes`` are (x0, y0, x1, y1) in pixels, the image spanning [0, width] x [0, height];
-    ``labels`` are class indices from 0. ``bins`` are the pose bins of images, or of each of their boxes (-1: unknown),
-    for reports only.
+    ``labels`` are class indices from 0. ``bins`` are the bins, from 0, of the first binned factor of p_psi, one for
+    each image or one for each box (-1: unknown), for reports only.
     """
 
     images: Float[Tensor, "images 3 height width"]
