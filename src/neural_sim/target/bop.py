@@ -30,7 +30,7 @@ from neural_sim.target.frames import (
     numbers,
     rigid,
 )
-from neural_sim.target.posed import PosedTarget
+from neural_sim.target.posed_target import PosedTarget
 from neural_sim.types import PinholeCamera
 
 MILLIMETRE = 1e-3

@@ -22,12 +22,12 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.pictures import read_header, refuse_mode
 from neural_sim.ranges import validated
 from neural_sim.target.base import AnnotatedPhotographs
-from neural_sim.target.bin_matching import matching
 from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.classes import ClassMap
 from neural_sim.target.coco_file import COCO_KIND, CocoFile, Entry, listed_size, name_of, refuse_size
 from neural_sim.target.other_formats import missing_file
 from neural_sim.target.photographs import Photograph
+from neural_sim.target.pose_bins import matching
 from neural_sim.target.split import groups_of
 from neural_sim.types import LabelledImages, PinholeCamera
 
@@ -51,7 +51,7 @@ class CocoTarget(AnnotatedPhotographs):
             like ``dominant`` of a distribution; dots lead into nested entries (``attributes.pose``). Boxes without it
             have no bin. None: no box has one.
         match_bins: in every part, choose photographs such that each object's bins follow the ``target`` of the first
-            parameter with bins, see ``neural_sim.target.bin_matching.matching``. Needs photographs of a single object
+            parameter with bins, see ``neural_sim.target.pose_bins.matching``. Needs photographs of a single object
             each.
 
     See ``Photographs`` for the other arguments.

@@ -24,8 +24,8 @@ from neural_sim.target.base import Photographs
 from neural_sim.target.classes import ClassMap
 from neural_sim.target.frames import Frame, FrameName, FrameReader, Listed, PosedObject
 from neural_sim.target.photographs import Photograph, read
+from neural_sim.target.pose_bins import bins_of_poses
 from neural_sim.target.split import evenly, groups_of
-from neural_sim.target.viewpoint import bins_of_poses
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
@@ -199,7 +199,7 @@ class PosedTarget(Photographs):
     ) -> LabelledImages:
         """Read any photographs of the data set; labels are positions in ``objects``.
 
-        With ``distribution`` each box has the bin of its pose, see ``neural_sim.target.viewpoint.bins_of_poses``, which
+        With ``distribution`` each box has the bin of its pose, see ``neural_sim.target.pose_bins.bins_of_poses``, which
         needs ``radii`` (metres, by object).
 
         Raises:
