@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from neural_sim.report.bootstrap import THRESHOLDS, Matches
 from neural_sim.report.runs import FinishedRun, Group
+from neural_sim.report.score_table import THRESHOLDS, Matches
 from neural_sim.studies.experiments.settings import Setting
 
 IMAGES = 60

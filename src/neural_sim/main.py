@@ -350,7 +350,7 @@ class SweepTable(Callback):
 
     @override
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        from neural_sim.report.sweep import sweep_table
+        from neural_sim.report.run import sweep_table
 
         folder = Path(config.hydra.sweep.dir)
         if folder.is_dir() and (table := sweep_table(folder)):

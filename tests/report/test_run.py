@@ -1,4 +1,4 @@
-"""What a run leaves: results.json by the standard, figures, the training set, MLflow."""
+"""What a run leaves: results.json by the standard, figures, the training set, MLflow; and the table of a sweep."""
 
 import dataclasses
 import json
@@ -10,7 +10,7 @@ from mlflow import MlflowClient
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.report import tracking
 from neural_sim.report.figures import image_grid, psi_figure, strip_figure, write_figures
-from neural_sim.report.run import Learned, RunResults, write_results
+from neural_sim.report.run import Learned, RunResults, sweep_table, write_results
 from neural_sim.report.run_tracking import live_run
 from neural_sim.types import LabelledImages
 
@@ -283,3 +283,38 @@ def test_what_was_reached_charts_by_what_was_spent(results, uri, tmp_path):
         ("biased_ap_by_seconds", {0: 0.6, 10: 0.6}),
     ):
         assert steps(uri, found.run_id, f"curve/{name}") == pytest.approx(expected)
+
+
+def job(folder, name, overrides, after=None, scale="quick"):
+    (folder / name / ".hydra").mkdir(parents=True)
+    (folder / name / ".hydra" / "overrides.yaml").write_text(json.dumps(overrides))
+    if after is None:
+        return
+    ap = {
+        which: {"ap": 0.1, "per_class": {"mug": value, "can": None}}
+        for which, value in {"ns": 0.25, "learned": after, "matched": 0.75}.items()
+    }
+    held = {"score": "AP", "scale": scale, "biased": ["mug", "can"], "ap": ap}
+    (folder / name / "results.json").write_text(json.dumps(held))
+
+
+def test_a_sweep_ends_with_what_its_runs_scored_by_what_was_swept(tmp_path):
+    job(tmp_path, "10_seed=2", ["+experiment=pose_gap", "seed=2", "baseline=lts"])
+    job(tmp_path, "2_seed=1", ["+experiment=pose_gap", "seed=1", "baseline=lts"], 0.5)
+    job(tmp_path, "0_seed=0", ["+experiment=pose_gap", "seed=0", "baseline=lts"], 0.625)
+    (tmp_path / "mlruns").mkdir()
+    lines = sweep_table(tmp_path).splitlines()
+    assert lines[0] == "| seed | AP before | AP after | AP if the target were known | folder |"
+    assert lines[2:5] == [
+        "| 0 | 25.0 | 62.5 | 75.0 | 0_seed=0 |",
+        "| 1 | 25.0 | 50.0 | 75.0 | 2_seed=1 |",
+        "| 2 | no results |  |  | 10_seed=2 |",
+    ]
+    assert lines[-1] == f"pages: {tmp_path}/<folder>/report.html"
+
+
+def test_a_sweep_of_trials_says_so_and_one_result_is_no_table(tmp_path):
+    job(tmp_path, "0", ["seed=0", "scale=smoke"], 0.5, "smoke")
+    assert sweep_table(tmp_path) == ""
+    job(tmp_path, "1", ["seed=1", "scale=smoke"], 0.5, "smoke")
+    assert sweep_table(tmp_path).startswith("A trial (scale=smoke)")

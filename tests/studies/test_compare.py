@@ -8,8 +8,7 @@ from dataclasses import replace
 import pytest
 
 from neural_sim.report import tracking
-from neural_sim.report.comparison import ONLY_AT_END, Comparison
-from neural_sim.report.costs import NOTE, SECONDS, Costs
+from neural_sim.report.comparison import NOTE, ONLY_AT_END, SECONDS, Comparison, Costs
 from neural_sim.report.intervals import Estimate
 from neural_sim.report.runs import FinishedRun, Group, LeftOut, Runs
 from neural_sim.studies.compare import Compare, Table, verdict, write_page

@@ -8,8 +8,7 @@ import pytest
 import torch
 from mlflow import MlflowClient
 
-from neural_sim.report.bootstrap import match
-from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.score_table import ScoreTable, match
 from neural_sim.studies.sources import SideBySide, publish, table
 from neural_sim.types import LabelledImages
 

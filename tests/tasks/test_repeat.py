@@ -9,9 +9,8 @@ from finished_runs import IMAGES, matches
 from scipy.stats import t as student
 
 from neural_sim.main import UserError, context_of
-from neural_sim.report.bootstrap import THRESHOLDS, Matches
 from neural_sim.report.page.verdict import Gain
-from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.score_table import THRESHOLDS, Matches, ScoreTable
 from neural_sim.tasks.repeat import APART, again, groups, sentence, table
 
 

@@ -7,7 +7,6 @@ three are digests in results.json, see ``identity``.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,10 +14,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from neural_sim.detector.protocol import Score
-from neural_sim.report import coco, tracking
-from neural_sim.report.bootstrap import Outcomes, match
+from neural_sim.documents import read_json
+from neural_sim.report import tracking
+from neural_sim.report.detections import DETECTIONS, read_detections
 from neural_sim.report.identity import KEYS, all_values, differences, headings, scored_values
-from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.score_table import Outcomes, ScoreTable, match
 
 BOUNDS = ("ns", "matched")
 """Detectors that every run has, whatever its method: trained on the initial distribution and, if known, on the
@@ -251,11 +251,11 @@ def _read(run: tracking.LoggedRun, experiment: str) -> FinishedRun:
     known = FinishedRun(name=run.name, run_id=run.run_id, experiment=experiment)
     if run.status != "FINISHED":
         return replace(known, unusable=f"its status in MLflow is {run.status}")
-    for file in (RESULTS, coco.FILE):
+    for file in (RESULTS, DETECTIONS):
         if file not in run.files:
             return replace(known, unusable=f"it was not evaluated: it left no {file}")
-    results = json.loads(run.fetch(RESULTS).read_text(encoding="utf-8"))
-    return replace(known, results=results, read=lambda: read_outcomes(results, run.fetch(coco.FILE)))
+    results = read_json(run.fetch(RESULTS))
+    return replace(known, results=results, read=lambda: read_outcomes(results, run.fetch(DETECTIONS)))
 
 
 def read_outcomes(results: Mapping[str, Any], file: Path) -> dict[str, list[Outcomes]]:
@@ -266,7 +266,7 @@ def read_outcomes(results: Mapping[str, Any], file: Path) -> dict[str, list[Outc
         file: detections.json.
     """
     names = list(results["psi"])
-    truth, detections = coco.read_detections(file)
+    truth, detections = read_detections(file)
     score: Score = results.get("score", "AP")
     labels = [names.index(name) for name in results["biased"]]
     return {which: [match(own, truth, label, score) for label in labels] for which, own in detections.items()}

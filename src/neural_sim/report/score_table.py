@@ -1,6 +1,9 @@
 """Scores of detectors over seeds, classes and test images: the one place that computes means, intervals and leads.
 
-All detectors of a seed are scored on one test set, so that comparisons are paired, by seed and by image.
+All detectors of a seed are scored on one test set, so that comparisons are paired, by seed and by image. Intervals come
+from a bootstrap over test images that evaluates each detector only once: whether a detection is matched depends on its
+own image only. Drawing images with replacement therefore only changes how often each detection and each box counts. AP
+is then a weighted sum over detections in the order of their scores, and accuracy a weighted mean over images.
 """
 
 from __future__ import annotations
@@ -9,10 +12,146 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torchvision.ops import box_iou
 
-from neural_sim.report.bootstrap import Outcomes, class_scores, mean_of_known
+from neural_sim.detector.metrics import best_classes
+from neural_sim.detector.protocol import Score
 from neural_sim.report.intervals import Estimate, Sample, over_seeds_and_images, ratio
+from neural_sim.types import LabelledImages
+
+# Rounded to float32 as in torchmetrics, because it decides on which side of 0.28 a recall of exactly 0.28 falls.
+THRESHOLDS = torch.linspace(0.5, 0.95, 10).double().numpy()
+RECALLS = torch.linspace(0.0, 1.0, 101).double().numpy()
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Detections of one class in a test set, best first, and whether each is correct at each COCO threshold."""
+
+    image: Int[np.ndarray, "detections"]
+    correct: Bool[np.ndarray, "detections thresholds"]
+    boxes_per_image: Int[np.ndarray, "images"]
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Images of one class (where ``boxes_per_image`` is 1), and whether each image's best class is this one."""
+
+    correct: Bool[np.ndarray, "images"]
+    boxes_per_image: Int[np.ndarray, "images"]
+
+
+Outcomes = Matches | Hits
+"""The outcomes from which the score of one class in a test set is computed."""
+
+
+def match(
+    predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int, score: Score = "AP"
+) -> Outcomes:
+    """Match the predictions of one class with its labels, as the basis of the class's score.
+
+    For AP, detections are matched by COCO's rules: in each image from the best down, each to the unmatched box that it
+    overlaps most.
+
+    Args:
+        predictions: the predictions on every image.
+        images: the images with their boxes.
+        label: the class.
+        score: AP or accuracy.
+    """
+    if score == "accuracy":
+        own = (images.labels == label).any(1).cpu().numpy().astype(int)
+        return Hits((best_classes(predictions) == label).numpy(), own)
+    rows, scores, correct, counts = [], [], [], []
+    for index, detections in enumerate(predictions):
+        truth = images.boxes[index][images.labels[index] == label]
+        counts.append(len(truth))
+        own = detections["labels"] == label
+        order = detections["scores"][own].argsort(descending=True, stable=True)[:100]
+        if len(truth):
+            overlap = box_iou(detections["boxes"][own][order].float(), truth.float()).numpy()
+        else:  # a shortcut, because most images show other objects
+            overlap = np.zeros((len(order), 0))
+        rows += [index] * len(order)
+        scores += detections["scores"][own][order].tolist()
+        correct += list(_greedy(overlap))
+    best_first = np.argsort(-np.asarray(scores), kind="stable")
+    table = np.asarray(correct, dtype=bool).reshape(len(rows), len(THRESHOLDS))
+    return Matches(np.asarray(rows, dtype=int)[best_first], table[best_first], np.asarray(counts))
+
+
+def _greedy(overlap: Float[np.ndarray, "detections boxes"]) -> Bool[np.ndarray, "detections thresholds"]:
+    correct = np.zeros((overlap.shape[0], len(THRESHOLDS)), dtype=bool)
+    if overlap.shape[1] == 0:
+        return correct
+    free = np.ones((len(THRESHOLDS), overlap.shape[1]), dtype=bool)
+    every = np.arange(len(THRESHOLDS))
+    for d, row in enumerate(overlap):
+        candidates = np.where(free, row, -1.0)
+        best = candidates.argmax(1)
+        correct[d] = candidates[every, best] >= THRESHOLDS
+        free[every, best] &= ~correct[d]
+    return correct
+
+
+def class_score(outcomes: Outcomes, weights: Float[np.ndarray, "images"] | None = None) -> float:
+    """Return the score of one class, nan without a box; ``weights`` say how often each image counts."""
+    if isinstance(outcomes, Matches):
+        return average_precision(outcomes, weights)
+    shown = outcomes.boxes_per_image * (1.0 if weights is None else weights)
+    total = float(shown.sum())
+    return float((shown * outcomes.correct).sum() / total) if total else float("nan")
+
+
+def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | None = None) -> float:
+    """Return AP from 101 recalls, averaged over COCO's thresholds; nan without a box. ``weights`` weigh the images."""
+    weights = np.ones(len(matches.boxes_per_image)) if weights is None else weights
+    boxes = float((weights * matches.boxes_per_image).sum())
+    if boxes == 0.0:
+        return float("nan")
+    each = weights[matches.image][:, None]
+    right = (each * matches.correct).cumsum(0)
+    total = each.cumsum(0)
+    precision = np.maximum.accumulate((right / np.maximum(total, 1e-12))[::-1])[::-1]
+    recall = right / boxes
+    values = []
+    for t in range(len(THRESHOLDS)):
+        at = np.searchsorted(recall[:, t], RECALLS, side="left")
+        values.append(precision[at[at < len(recall)], t].sum() / len(RECALLS))
+    return float(np.mean(values))
+
+
+def class_scores(
+    matches: Sequence[Sequence[Sequence[Outcomes]]], draws: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "groups rows classes"], Float[np.ndarray, "draws groups rows classes"]]:
+    """Return the scores of ``matches`` [group][detector][class], on the test images and on resampled ones.
+
+    All test sets of the same size are resampled alike, so that differences between detectors that share a test set are
+    paired.
+    """
+    random = np.random.default_rng(seed)
+    counts = sorted({len(outcomes.boxes_per_image) for group in matches for row in group for outcomes in row})
+
+    def scored(weights: Mapping[int, Float[np.ndarray, "_"] | None]) -> list[list[list[float]]]:
+        return [
+            [[class_score(o, weights[len(o.boxes_per_image)]) for o in row] for row in g] for g in matches
+        ]
+
+    def drawn() -> dict[int, Float[np.ndarray, "_"]]:
+        return {n: np.bincount(random.integers(n, size=n), minlength=n).astype(float) for n in counts}
+
+    point = np.asarray(scored(dict.fromkeys(counts)))
+    return point, np.asarray([scored(drawn()) for _ in range(draws)])
+
+
+def mean_of_known(scores: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
+    """Return the mean over the classes that have a score; nan if none has one."""
+    known = ~np.isnan(scores)
+    counts = known.sum(-1)
+    return np.where(counts, np.where(known, scores, 0.0).sum(-1) / np.maximum(counts, 1), np.nan)
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,19 @@ from neural_sim.detector.metrics import IN_FULL
 from neural_sim.documents import markdown_table, write_whole
 from neural_sim.ranges import validated
 from neural_sim.report import figures, tracking
-from neural_sim.report.comparison import ONLY_AT_END, Clock, Comparison, biased_ap, compare
-from neural_sim.report.costs import HEAD, NOTE, Costs, cells, costs, costs_table
+from neural_sim.report.comparison import (
+    HEAD,
+    NOTE,
+    ONLY_AT_END,
+    Clock,
+    Comparison,
+    Costs,
+    biased_ap,
+    cells,
+    compare,
+    costs,
+    costs_table,
+)
 from neural_sim.report.figures import Figure
 from neural_sim.report.intervals import bounds, points
 from neural_sim.report.page import render

@@ -12,7 +12,7 @@ from annotated_types import Ge
 from typing_extensions import override
 
 from neural_sim.ranges import Ascending, NonNegativeInt, PositiveInt, validated
-from neural_sim.report.coco import write_training_set
+from neural_sim.report.detections import write_training_set
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.scene import LoadedImagesStage, MeshSubjectStage

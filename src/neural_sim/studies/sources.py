@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 
 from neural_sim.documents import markdown_table
 from neural_sim.report import figures
-from neural_sim.report.bootstrap import Outcomes, match
 from neural_sim.report.figures import CLASS_COLOURS, GRID, INK
 from neural_sim.report.intervals import Estimate, points
-from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.score_table import Outcomes, ScoreTable, match
 from neural_sim.report.tracking import Run
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.evaluate import ScoresStage

@@ -18,8 +18,7 @@ from neural_sim.devices import device_of
 from neural_sim.documents import write_json
 from neural_sim.pictures import check_headers
 from neural_sim.ranges import Fraction, PositiveInt, validated
-from neural_sim.report.coco import result_rows
-from neural_sim.report.predictions import draw, save_picture, scores_table
+from neural_sim.report.detections import draw, result_rows, save_picture, scores_table
 from neural_sim.target.photographs import PhotoFiles
 from neural_sim.target.truth import Truth, without_pixels
 from neural_sim.tasks.context import Context, Task

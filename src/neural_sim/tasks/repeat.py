@@ -13,11 +13,10 @@ from typing_extensions import override
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import markdown_table, write_json, write_whole
 from neural_sim.ranges import validated
-from neural_sim.report.bootstrap import Outcomes, match
 from neural_sim.report.intervals import points
 from neural_sim.report.page.verdict import Gain, verdict
 from neural_sim.report.run import CALLED
-from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.score_table import Outcomes, ScoreTable, match
 from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.stage import Stage

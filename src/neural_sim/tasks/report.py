@@ -15,7 +15,7 @@ from typing_extensions import override
 from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.devices import peak_memory_mb, placed
 from neural_sim.documents import write_whole
-from neural_sim.report.coco import write_detections, write_training_set
+from neural_sim.report.detections import write_detections, write_training_set
 from neural_sim.report.figures import write_figures
 from neural_sim.report.identity import identity
 from neural_sim.report.page.run_page import PER_OBJECT, RunPage, Shown

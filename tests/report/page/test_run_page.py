@@ -12,7 +12,7 @@ import torch
 
 from neural_sim.report.page import run_page
 from neural_sim.report.page.psi import learned_psi
-from neural_sim.report.page.run_page import RunPage, Shown, write_run_page
+from neural_sim.report.page.run_page import RunPage, Shown
 from neural_sim.report.provenance import Made
 from neural_sim.report.run import RunResults
 from neural_sim.types import LabelledImages
@@ -94,7 +94,7 @@ def headings(page):
 
 def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, shown, tmp_path):
     (tmp_path / "results.json").write_text("{}")
-    page = write_run_page(results, shown, COMMANDS, tmp_path).read_text()
+    page = RunPage(results, shown).write(COMMANDS, tmp_path).read_text()
     assert headings(page) == [
         "Scores", "What was learned", "What is still weak", "Training images", "Detections on test images",
         "How far to trust it", "What it cost", "Next",
@@ -113,9 +113,11 @@ def test_a_page_says_what_the_first_step_was_and_what_was_taken_back(results, sh
     first, last = results.records
     first = {**first, "verdicts": last["verdicts"]}
     last = {**last, "taken_back": {"mug": {"kept": 1, "accepted": 3, "gain": 0.02}}}
-    text = write_run_page(
-        dataclasses.replace(results, records=[first, last]), shown, COMMANDS, tmp_path
-    ).read_text()
+    text = (
+        RunPage(dataclasses.replace(results, records=[first, last]), shown)
+        .write(COMMANDS, tmp_path)
+        .read_text()
+    )
     assert "read off the target's boxes" in text and "mug accepted (+0.200 ± 0.010" in text
     assert "mug went back to where it was after 1 of 3 accepted steps" in text
 
@@ -125,9 +127,11 @@ def test_a_page_says_that_photographs_have_an_unknown_distribution(results, show
     ap = {which: scores for which, scores in results.ap.items() if which != "matched"}
     scored = {which: found for which, found in shown.detections.items() if which != "matched"}
     photographs = dataclasses.replace(results, probabilities=known, ap=ap)
-    page = write_run_page(
-        photographs, dataclasses.replace(shown, detections=scored), COMMANDS, tmp_path
-    ).read_text()
+    page = (
+        RunPage(photographs, dataclasses.replace(shown, detections=scored))
+        .write(COMMANDS, tmp_path)
+        .read_text()
+    )
     text = re.sub(r'src="[^"]*"|<style>.*?</style>', "", page, flags=re.DOTALL)
     assert (
         "the learned distribution gave" in text
@@ -146,7 +150,7 @@ def test_a_classification_s_page_speaks_of_accuracy(results, shown, tmp_path):
     scores = {which: {"accuracy": 0.5, "per_class": s["per_class"]} for which, s in results.ap.items()}
     points = [{**point, "ap": scores["ns"]} for point in results.curve]
     found = dataclasses.replace(results, score="accuracy", ap=scores, curve=points)
-    page = write_run_page(found, dataclasses.replace(shown, detections=moved), COMMANDS, tmp_path).read_text()
+    page = RunPage(found, dataclasses.replace(shown, detections=moved)).write(COMMANDS, tmp_path).read_text()
     assert "gave 50.0 points of accuracy more on mug" in page and "Accuracy: the fraction of a class" in page
     assert all(text in page for text in ("Won (12 of 24)", "Still wrong (6 of 24)", "Right (6 of 24)"))
     text = re.sub(r'src="[^"]*"', "", page)
@@ -155,14 +159,14 @@ def test_a_classification_s_page_speaks_of_accuracy(results, shown, tmp_path):
 
 def test_a_run_without_scores_and_without_steps_says_so(results, shown, tmp_path):
     bare = dataclasses.replace(results, ap={}, curve=(), records=[])
-    page = write_run_page(bare, dataclasses.replace(shown, detections={}), {}, tmp_path).read_text()
+    page = RunPage(bare, dataclasses.replace(shown, detections={})).write({}, tmp_path).read_text()
     assert headings(page) == ["Training images", "What it cost", "Next"]
     assert "whether it worked is not known" in page
 
 
 def test_a_class_that_the_test_set_lacks_has_no_verdict(results, shown, tmp_path):
     one = dataclasses.replace(shown.test, labels=torch.zeros_like(shown.test.labels))
-    page = write_run_page(results, dataclasses.replace(shown, test=one), {}, tmp_path).read_text()
+    page = RunPage(results, dataclasses.replace(shown, test=one)).write({}, tmp_path).read_text()
     assert "The other objects" not in page and "on mug" in page
 
 
@@ -172,7 +176,7 @@ def test_a_browser_shows_the_page_without_a_sideways_scroll(results, shown, tmp_
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no Chromium")
-    page = write_run_page(results, shown, COMMANDS, tmp_path)
+    page = RunPage(results, shown).write(COMMANDS, tmp_path)
     probe = "<script>document.title = [innerWidth, document.documentElement.scrollWidth, document.images.length, " \
         "[...document.images].filter(i => i.naturalWidth).length].join()</script></body>"  # fmt: skip
     page.write_text(page.read_text().replace("</body>", probe).replace('loading="lazy"', ""))
@@ -201,9 +205,11 @@ def test_a_page_says_how_it_was_made_and_warns_of_a_trial(results, shown, tmp_pa
 
 def test_every_bin_is_pictured_with_its_share_and_its_score(results, shown, tmp_path):
     one = dataclasses.replace(results, symmetric_bins={"can": {"pose": [[1, 3], [2], [4]]}})
-    page = write_run_page(
-        one, dataclasses.replace(shown, bins=thumbnails("mug", "can")), {}, tmp_path
-    ).read_text()
+    page = (
+        RunPage(one, dataclasses.replace(shown, bins=thumbnails("mug", "can")))
+        .write({}, tmp_path)
+        .read_text()
+    )
     assert page.count('alt="mug from bin') > 4 and page.count('alt="can from bin') >= 4
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", re.sub(r'src="[^"]*"', "", page)))
     # The mug goes from a quarter to 0.85 in bin 1, as in the target; all images of bin 1 are right, half of bin 2.
@@ -223,7 +229,7 @@ def test_what_was_forgotten_is_told_by_bin_with_its_share(results, shown, tmp_pa
         for i, each in enumerate(before)
     ]
     lost = dataclasses.replace(shown, detections={**shown.detections, "ns": before, "learned": after})
-    page = write_run_page(results, lost, {}, tmp_path).read_text()
+    page = RunPage(results, lost).write({}, tmp_path).read_text()
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", "", page))
     assert "mug from bin 1: AP 100 before, 0 after (a loss of 100 to 100) on 6 test images, 50 %" in text
     assert "went from 25 to 85 %" in text and text.count("before, 0 after") == 1
@@ -231,9 +237,9 @@ def test_what_was_forgotten_is_told_by_bin_with_its_share(results, shown, tmp_pa
 
 def test_a_curve_is_drawn_of_three_points_or_more_with_labels_that_do_not_meet(results, shown, tmp_path):
     alt = 'alt="AP against seconds"'
-    assert alt not in write_run_page(results, shown, {}, tmp_path).read_text()
+    assert alt not in RunPage(results, shown).write({}, tmp_path).read_text()
     points = [{**results.curve[0], "seconds": at} for at in (0.0, 1.0, 50.0, 99.0, 100.0)]
-    assert alt in write_run_page(dataclasses.replace(results, curve=points), shown, {}, tmp_path).read_text()
+    assert alt in RunPage(dataclasses.replace(results, curve=points), shown).write({}, tmp_path).read_text()
     assert sorted(run_page._apart([0.0, 1.0, 50.0, 99.0, 100.0])) == [1, 2, 4]
 
 

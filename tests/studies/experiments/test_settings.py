@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from finished_runs import BUDGET, finished, results
 
-from neural_sim.report.bootstrap import average_precision
 from neural_sim.report.comparison import compare
 from neural_sim.report.runs import FinishedRun, Group, Runs
+from neural_sim.report.score_table import average_precision
 from neural_sim.studies.experiments.settings import MEAN, Setting, Settings, modes
 
 

@@ -16,16 +16,14 @@ from neural_sim.detector.protocol import Score
 from neural_sim.documents import write_whole
 from neural_sim.outer.certificate import untrusted
 from neural_sim.report import figures
-from neural_sim.report.bootstrap import match
 from neural_sim.report.figures import Figure, Thumbnails
 from neural_sim.report.page import pictures, render
 from neural_sim.report.page.pictures import Picture
-from neural_sim.report.page.psi import learned_psi, shown_chart
-from neural_sim.report.page.steps import step_rows
+from neural_sim.report.page.psi import learned_psi, shown_chart, step_rows
 from neural_sim.report.page.verdict import POINTS, Gain, listed, verdict
 from neural_sim.report.page.weak_bins import BinScore, bin_scores, forgotten, weaknesses
 from neural_sim.report.run import CALLED, RunResults
-from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.score_table import ScoreTable, match
 from neural_sim.types import LabelledImages
 
 FILE = "report.html"
@@ -169,11 +167,6 @@ class RunPage:
             files={name: what for name, what in FILES.items() if (folder / name).exists()},
         )
         return write_whole(folder / FILE, text)
-
-
-def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str], folder: Path) -> Path:
-    """Write report.html, see ``RunPage.write``."""
-    return RunPage(results, shown).write(commands, folder)
 
 
 def score_table(shown: Shown, names: Sequence[str], score: Score) -> ScoreTable:

@@ -10,9 +10,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from neural_sim.detector.protocol import Score
-from neural_sim.report.bootstrap import class_score, match
 from neural_sim.report.intervals import Estimate
-from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.score_table import ScoreTable, class_score, match
 from neural_sim.types import LabelledImages
 
 Detections = Mapping[str, Sequence[Mapping[str, Tensor]]]

@@ -14,7 +14,7 @@ from neural_sim.configuration import conf_directory
 from neural_sim.documents import markdown_table, write_json, write_whole
 from neural_sim.ranges import validated
 from neural_sim.report import figures
-from neural_sim.report.costs import costs_table
+from neural_sim.report.comparison import costs_table
 from neural_sim.report.runs import LeftOut
 from neural_sim.studies.compare import left_out_table
 from neural_sim.studies.experiments.layouts import LAYOUTS, Paper

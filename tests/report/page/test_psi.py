@@ -1,6 +1,6 @@
 """The table of steps: what each record and the one after it say."""
 
-from neural_sim.report.page.steps import step_rows
+from neural_sim.report.page.psi import step_rows
 
 
 def record(actions, verdicts=None, doubts=()):

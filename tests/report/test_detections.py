@@ -3,7 +3,7 @@
 import math
 
 from neural_sim.detector.metrics import Accuracy, AveragePrecision
-from neural_sim.report.predictions import scores_table
+from neural_sim.report.detections import scores_table
 
 
 def test_a_detector_s_scores_are_two_and_a_classifier_s_one():

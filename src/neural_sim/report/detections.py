@@ -1,22 +1,25 @@
-"""COCO files of a run: result rows, ``detections.json`` with the test set's boxes, and the final training set."""
+"""Detections in files: COCO rows, ``detections.json``, pictures and a table of scores; and the final training set."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from neural_sim.cameras import orbit
-from neural_sim.documents import write_json
+from neural_sim.detector.metrics import AveragePrecision, TestScore
+from neural_sim.documents import read_json, write_json
+from neural_sim.report.figures import CLASS_COLOURS
 from neural_sim.synthesis.assembly import RenderedImages
 from neural_sim.synthesis.export.coco import write_coco
+from neural_sim.target.truth import without_pixels
 from neural_sim.types import LabelledImages
 
-FILE = "detections.json"
+DETECTIONS = "detections.json"
 
 Detections = Mapping[str, Tensor]
 """One image's ``boxes`` (x0, y0, x1, y1) in pixels, ``labels`` from 0 and ``scores``."""
@@ -61,22 +64,16 @@ def write_detections(
         which: [row for index, image in enumerate(images) for row in result_rows(image, index, rounded=True)]
         for which, images in {"truth": truth, **detections}.items()
     }
-    return write_json(folder / FILE, {"images": len(test), **rows}, indent=None)
+    return write_json(folder / DETECTIONS, {"images": len(test), **rows}, indent=None)
 
 
 def read_detections(file: Path) -> tuple[LabelledImages, dict[str, list[Detections]]]:
     """Read detections.json: the test set without pixels, and the detections of every detector."""
-    stored = json.loads(file.read_text(encoding="utf-8"))
+    stored = read_json(file)
     count = stored.pop("images")
     by_image = {which: _by_image(rows, count) for which, rows in stored.items()}
     truth = by_image.pop("truth")
-    most = max(len(image["labels"]) for image in truth)
-    boxes, labels = torch.zeros(count, most, 4), torch.full((count, most), -1)
-    for index, image in enumerate(truth):
-        boxes[index, : len(image["labels"])] = image["boxes"]
-        labels[index, : len(image["labels"])] = image["labels"]
-    bins = torch.zeros(count, dtype=torch.long)
-    return LabelledImages(torch.zeros(count, 3, 1, 1), boxes, labels, bins), by_image
+    return without_pixels([(image["boxes"], image["labels"]) for image in truth]), by_image
 
 
 def _by_image(rows: Sequence[Mapping[str, Any]], count: int) -> list[Detections]:
@@ -105,3 +102,68 @@ def write_training_set(rendered: RenderedImages, names: Sequence[str], folder: P
             pose = {key: value[place] for key, value in listed.items()}
             poses[row].append({"category_id": label + 1, **pose})
     return write_coco(rendered.images, list(names), folder, poses)
+
+
+WRITABLE = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+
+
+def draw(
+    photo: Image.Image,
+    found: Detections,
+    class_names: Sequence[str],
+    above: float,
+    truth: Tensor | None = None,
+) -> Image.Image:
+    """Draw detections on a copy of an RGB photograph, the best on top, each with its class and score.
+
+    Args:
+        photo: the photograph.
+        found: its detections.
+        class_names: names of the classes, by label.
+        above: smallest score that is drawn.
+        truth: true boxes, (x0, y0, x1, y1) in pixels, drawn thin and white.
+    """
+    drawn = photo.copy()
+    pen, side = ImageDraw.Draw(drawn), max(photo.size)
+    for box in [] if truth is None else truth.tolist():
+        pen.rectangle(box, outline="white", width=max(1, side // 600))
+    font, thick = ImageFont.load_default(size=max(10, side / 45)), max(2, side // 300)
+    rows = zip(*(found[key].tolist() for key in ("scores", "labels", "boxes")), strict=True)
+    for score, label, box in sorted((row for row in rows if row[0] >= above), key=lambda row: row[0]):
+        colour = CLASS_COLOURS[label % len(CLASS_COLOURS)]
+        pen.rectangle(box, outline=colour, width=thick)
+        caption = f" {class_names[label]} {score:.2f} "
+        _, _, wide, high = pen.textbbox((0, 0), caption, font=font)
+        # Captions go above the box, or inside it if there is no room, and never past the picture's right edge.
+        left = max(0, min(box[0], photo.width - wide))
+        top = box[1] - high - 2 if box[1] >= high + 2 else box[1]
+        pen.rectangle((left, top, left + wide, top + high + 2), fill=colour)
+        pen.text((left, top), caption, fill="white", font=font)
+    return drawn
+
+
+def save_picture(picture: Image.Image, folder: Path, name: str) -> Path:
+    """Write a picture under its photograph's name, as PNG if PIL does not write the photograph's format well."""
+    path = folder / name
+    if path.suffix.lower() not in WRITABLE:
+        path = path.with_name(f"{path.name}.png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() in (".jpg", ".jpeg", ".webp"):
+        picture.save(path, quality=92)
+    else:
+        picture.save(path)
+    return path
+
+
+def scores_table(scores: TestScore, images: int) -> str:
+    """Return the printed table of scores by class, in percent."""
+    if isinstance(scores, AveragePrecision):
+        name, columns = "AP", {"AP": scores.per_class, "AP50": scores.per_class_ap50}
+        means = [scores.ap, scores.ap50]
+    else:
+        name, columns, means = "accuracy", {"accuracy": scores.per_class}, [scores.accuracy]
+    lines = [f"{f'{name} on {images} pictures':<28}" + "".join(f"{column:>8}" for column in columns)]
+    rows = {of: [column[of] for column in columns.values()] for of in scores.per_class} | {"mean": means}
+    for of, row in rows.items():
+        lines.append(f"{of[:27]:<28}" + "".join(f"{100 * value:>8.1f}" for value in row))
+    return "\n".join(lines)
