@@ -6,7 +6,7 @@ import numpy as np
 
 from neural_sim.report.runs import FinishedRun, Group
 from neural_sim.report.score_table import THRESHOLDS, Matches
-from neural_sim.studies.experiments.settings import Setting
+from neural_sim.studies.experiments.results import Setting
 
 IMAGES = 60
 BUDGET = {

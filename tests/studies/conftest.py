@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from neural_sim.studies.work_precision.micro import small_scene
+from neural_sim.studies.work_precision.solver import small_scene
 from neural_sim.tasks.context import Context
 
 

@@ -12,7 +12,7 @@ from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
-from neural_sim.studies.frozen import FrozenLoop, State
+from neural_sim.studies.frozen_loop import FrozenLoop, State
 from neural_sim.studies.gumbel_temperature import Temperatures, against, bin_frequencies
 
 

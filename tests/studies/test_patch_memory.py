@@ -15,7 +15,7 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
-from neural_sim.studies.frozen import FrozenLoop, State
+from neural_sim.studies.frozen_loop import FrozenLoop, State
 from neural_sim.studies.patch_memory import FORWARD, WHOLE, PatchCost, PatchMemory, publish
 
 PATCHES = (64, 128, 256)

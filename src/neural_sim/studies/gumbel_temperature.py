@@ -25,7 +25,7 @@ from neural_sim.report import figures
 from neural_sim.report.figures import INK, METHOD_COLOURS, MUTED
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
-from neural_sim.studies.frozen import FrozenLoop, centred
+from neural_sim.studies.frozen_loop import FrozenLoop, centred
 from neural_sim.tasks.context import Context, Task
 
 BIAS, SPREAD = METHOD_COLOURS["learned"], "#e08a1e"

@@ -24,7 +24,7 @@ from neural_sim.parameter.product import HARD
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
-from neural_sim.studies.frozen import FrozenLoop
+from neural_sim.studies.frozen_loop import FrozenLoop
 from neural_sim.synthesis.assembly import RenderedObject, one_each
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import Maps

@@ -11,7 +11,7 @@ from neural_sim.configuration import UserError, conf_directory
 from neural_sim.report.runs import LeftOut
 from neural_sim.studies.experiments import study as module
 from neural_sim.studies.experiments.layouts import LAYOUTS, Paper
-from neural_sim.studies.experiments.measured import Measured
+from neural_sim.studies.experiments.results import Measured
 from neural_sim.studies.experiments.study import Experiments, Row, _to_first_table
 
 TABLE = {

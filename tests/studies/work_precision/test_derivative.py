@@ -3,7 +3,7 @@
 import pytest
 
 from neural_sim.studies.work_precision.derivative import Derivative, case, difference, forward, reverse
-from neural_sim.studies.work_precision.series import Timing
+from neural_sim.studies.work_precision.measurement import Timing
 
 
 @pytest.fixture(scope="module")

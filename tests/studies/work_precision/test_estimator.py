@@ -10,10 +10,10 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import LanczosDamping
-from neural_sim.studies.frozen import FrozenLoop, State
+from neural_sim.studies.frozen_loop import FrozenLoop, State
 from neural_sim.studies.work_precision.estimator import Estimators, ceilings, cosine, relative_error
-from neural_sim.studies.work_precision.micro import PSI, small_scene
-from neural_sim.studies.work_precision.series import Timing
+from neural_sim.studies.work_precision.measurement import Timing
+from neural_sim.studies.work_precision.solver import PSI, small_scene
 
 
 @pytest.fixture(scope="module")

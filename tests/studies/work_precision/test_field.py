@@ -9,7 +9,7 @@ from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.studies.work_precision.field import Fields, scaled
-from neural_sim.studies.work_precision.series import Timing
+from neural_sim.studies.work_precision.measurement import Timing
 
 RECIPE = FieldRecipe(
     partial(GridField),

@@ -27,8 +27,8 @@ from neural_sim.studies.work_precision.hypergradient import (
     slopes,
     ways,
 )
-from neural_sim.studies.work_precision.micro import PSI, small_scene
-from neural_sim.studies.work_precision.series import Timing
+from neural_sim.studies.work_precision.measurement import Timing
+from neural_sim.studies.work_precision.solver import PSI, small_scene
 
 SOLVER = AdjointSolver(damping=LanczosDamping(lanczos_steps=4), max_steps=4)
 OUTER = Outer(iterations=2, images_per_object=6, epochs=1, pool_per_bin=2)

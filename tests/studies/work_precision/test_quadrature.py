@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neural_sim.studies.work_precision import quadrature
+from neural_sim.studies.work_precision.measurement import Timing
 from neural_sim.studies.work_precision.quadrature import DENSITIES, SPAN, Quadrature, box, reference
-from neural_sim.studies.work_precision.series import Timing
 
 OFFSET = torch.rand(64, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 

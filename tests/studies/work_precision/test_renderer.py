@@ -2,8 +2,8 @@
 
 import pytest
 
+from neural_sim.studies.work_precision.measurement import Timing
 from neural_sim.studies.work_precision.renderer import Renderer, left_out, variants
-from neural_sim.studies.work_precision.series import Timing
 
 
 @pytest.fixture(scope="module")

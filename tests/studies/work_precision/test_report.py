@@ -7,6 +7,7 @@ import pytest
 from matplotlib import image
 from mlflow import MlflowClient
 
+from neural_sim.studies.work_precision.measurement import Order, Point, Series
 from neural_sim.studies.work_precision.report import (
     brief,
     document,
@@ -17,7 +18,6 @@ from neural_sim.studies.work_precision.report import (
     text_of,
     write_docs,
 )
-from neural_sim.studies.work_precision.series import Order, Point, Series
 
 MACHINE = {"processor": "a processor", "torch": "9.9", "threads": 1, "load": 0.5}
 SERIES = (

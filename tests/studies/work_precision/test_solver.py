@@ -13,7 +13,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.direct import Identity
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.studies.work_precision import solver as family
-from neural_sim.studies.work_precision.series import Timing
+from neural_sim.studies.work_precision.measurement import Timing
 from neural_sim.studies.work_precision.solver import Inverse, Oracle, Solver, product_problem, relative
 
 SOLVERS = {

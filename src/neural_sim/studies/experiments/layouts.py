@@ -10,10 +10,15 @@ from typing import Any
 from neural_sim.documents import markdown_table
 from neural_sim.report.figures import Figure
 from neural_sim.report.intervals import points
-from neural_sim.studies.experiments.histograms import histogram_entries, histogram_figure, histograms
-from neural_sim.studies.experiments.levels import Axis, levels_entries, levels_figure
-from neural_sim.studies.experiments.measured import Entry
-from neural_sim.studies.experiments.settings import MEAN, Setting, called
+from neural_sim.studies.experiments.charts import (
+    Axis,
+    histogram_entries,
+    histogram_figure,
+    histograms,
+    levels_entries,
+    levels_figure,
+)
+from neural_sim.studies.experiments.results import MEAN, Entry, Setting, called
 
 NONE = "none"
 WAYS = {NONE: "synthetic alone", "pretrain": "synthetic, then photographs", "combined": "both together"}

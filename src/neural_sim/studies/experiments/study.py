@@ -18,14 +18,14 @@ from neural_sim.report.comparison import costs_table
 from neural_sim.report.runs import LeftOut
 from neural_sim.studies.compare import left_out_table
 from neural_sim.studies.experiments.layouts import LAYOUTS, Paper
-from neural_sim.studies.experiments.measured import (
+from neural_sim.studies.experiments.results import (
     Measured,
+    Settings,
     document_of,
     newest_document,
     read_measured,
     write_measured,
 )
-from neural_sim.studies.experiments.settings import Settings
 from neural_sim.tasks.context import Context, Task
 
 NOT_YET = "not yet measured"

@@ -17,17 +17,25 @@ from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.hvp import gradient
-from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope, case, eps, not_finite, worst
-from neural_sim.studies.stress.subjects import (
+from neural_sim.studies.stress.cases import (
+    DOUBLE,
     EXACT,
+    SINGLE,
+    Check,
+    Checks,
+    Scope,
     along_x,
     block,
+    case,
     chord,
+    eps,
+    not_finite,
     opacity_of,
     outside,
     raw_density,
     rounding_of,
     small_detector,
+    worst,
 )
 from neural_sim.synthesis.compositing import boxes_from_opacity
 from neural_sim.types import LabelledImages, PinholeCamera, Rays

@@ -20,9 +20,18 @@ from neural_sim.solver.direct import Exact
 from neural_sim.solver.hvp import gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import flatten, unflatten
-from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite, worst
+from neural_sim.studies.stress.cases import (
+    DOUBLE,
+    Check,
+    Checks,
+    Scope,
+    case,
+    eps,
+    not_finite,
+    small_detector,
+    worst,
+)
 from neural_sim.studies.stress.linear import UNTRUSTED, ended, logarithmic, relative, system
-from neural_sim.studies.stress.subjects import small_detector
 from neural_sim.types import LabelledImages
 
 ROWS, SIZE, PSI = 12, 6, 3

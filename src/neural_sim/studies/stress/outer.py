@@ -26,8 +26,17 @@ from neural_sim.parameter.product import HardDraws, SceneDistribution
 from neural_sim.parameter.update import SGD, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite
-from neural_sim.studies.stress.subjects import block, small_detector
+from neural_sim.studies.stress.cases import (
+    DOUBLE,
+    Check,
+    Checks,
+    Scope,
+    block,
+    case,
+    eps,
+    not_finite,
+    small_detector,
+)
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import FieldSubject

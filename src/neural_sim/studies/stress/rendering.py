@@ -15,17 +15,25 @@ import torch
 from neural_sim.field.base import PackedSamples
 from neural_sim.field.quadrature import composite
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope, case, eps, short, worst
-from neural_sim.studies.stress.subjects import (
+from neural_sim.studies.stress.cases import (
+    DOUBLE,
     EXACT,
+    SINGLE,
+    Check,
+    Checks,
+    Scope,
     along_x,
     ball,
     block,
+    case,
     chord,
+    eps,
     opacity_of,
     outside,
     rounding_of,
     running_sum,
+    short,
+    worst,
 )
 from neural_sim.types import Rays
 

@@ -23,8 +23,7 @@ from neural_sim.field.rendering import render_samples
 from neural_sim.gradient.pathwise import contract
 from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.world import World
+from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 from neural_sim.synthesis.motion import RIGID, pose_rates
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 

@@ -24,9 +24,8 @@ from neural_sim.gradient.estimators import Estimator, ReinforceEstimator, Strati
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.update import shrinkage
 from neural_sim.ranges import Ascending, PositiveInt, validated
-from neural_sim.studies.frozen import FrozenLoop, centred
-from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.world import World
+from neural_sim.studies.frozen_loop import FrozenLoop, centred
+from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 from neural_sim.types import SceneDraw
 
 Estimates = Float[Tensor, "repeats objects k"]

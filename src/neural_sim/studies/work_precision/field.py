@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.ranges import Positive, validated
-from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.world import World
+from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 
 SCHEDULES = ("refine_steps", "prune_steps")
 """Arguments of a fitting that are step numbers, and scale with the number of steps."""

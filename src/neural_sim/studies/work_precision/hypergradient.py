@@ -27,8 +27,7 @@ from neural_sim.outer.settings import Outer
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.direct import Identity
-from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.world import World
+from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 
 _log = logging.getLogger(__name__)
 Slopes = Float[Tensor, "objects K"]

@@ -10,8 +10,7 @@ from typing import Any
 
 from neural_sim.report import tracking
 from neural_sim.report.runs import Runs, select
-from neural_sim.studies.work_precision.series import Clock, Point, Series, Timing
-from neural_sim.studies.work_precision.world import World
+from neural_sim.studies.work_precision.measurement import Clock, Point, Series, Timing, World
 
 Results = Mapping[str, Any]
 COMMAND = "python -m src.main -m +experiment={experiment} baseline=neural_sim,auto_sim,lts seed=0,1"

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from neural_sim.field.quadrature import PackedSamples, composite
 from neural_sim.ranges import Ascending, validated
-from neural_sim.studies.work_precision.series import Order, Point, Series, Timing, slope
+from neural_sim.studies.work_precision.measurement import Order, Point, Series, Timing, slope
 
 SPAN = 2.0
 """Length of every ray in object radii: the diameter of the unit sphere."""

@@ -15,8 +15,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.ranges import Fraction, Positive, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer, Quality
-from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.world import World
+from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 from neural_sim.types import PinholeCamera, Rays
 
 SHOWN = 0.01

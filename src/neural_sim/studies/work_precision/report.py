@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from neural_sim.documents import finite, markdown_table, read_json, replace_section, write_json
 from neural_sim.report import figures
 from neural_sim.report.tracking import Run
-from neural_sim.studies.work_precision.series import Point, Series
+from neural_sim.studies.work_precision.measurement import Point, Series
 from neural_sim.tasks.context import Context
 
 INTRODUCTION = (

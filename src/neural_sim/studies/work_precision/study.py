@@ -21,12 +21,11 @@ from neural_sim.studies.work_precision.estimator import Estimators
 from neural_sim.studies.work_precision.field import Fields
 from neural_sim.studies.work_precision.hypergradient import Hypergradients
 from neural_sim.studies.work_precision.loop import Loops
+from neural_sim.studies.work_precision.measurement import Clock, Family, Series, Timing, World
 from neural_sim.studies.work_precision.quadrature import Quadrature
 from neural_sim.studies.work_precision.renderer import Renderer
 from neural_sim.studies.work_precision.report import document, publish, write_docs
-from neural_sim.studies.work_precision.series import Clock, Series, Timing
 from neural_sim.studies.work_precision.solver import Solver
-from neural_sim.studies.work_precision.world import Family, World
 from neural_sim.tasks.context import Context, Task
 
 _log = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ import time
 import pytest
 import torch
 
-from neural_sim.studies.work_precision.series import Point, Series, Timing, pareto, slope
+from neural_sim.studies.work_precision.measurement import Point, Series, Timing, pareto, slope
 
 
 def test_pareto_by_definition():

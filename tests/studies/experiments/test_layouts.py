@@ -6,7 +6,7 @@ from finished_runs import setting as made_setting
 
 from neural_sim.report.runs import Group
 from neural_sim.studies.experiments.layouts import asked, photographs_summary, photographs_table
-from neural_sim.studies.experiments.settings import Setting
+from neural_sim.studies.experiments.results import Setting
 
 
 def setting(mode, trained=None, methods=(("neural_sim", 0.75), ("lts", 0.5)), count=None, fraction=None):
