@@ -1,12 +1,18 @@
 """A detector small enough for dense float64 checks, and a few labelled images."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from composing import composed
 from hydra.utils import instantiate
 
+from neural_sim.detector.cached_set import CachedSet
+from neural_sim.detector.onnx_export import export, largest_difference
 from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.saved_detector import SavedDetector
 from neural_sim.detector.settings import Anchors, Backbone, Head, Losses
+from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import LabelledImages
 
 CLASSES = 3
@@ -68,6 +74,46 @@ def mean_loss(detector: RetinaNet, params: dict[str, torch.Tensor], images: Labe
     )
 
 
+def check_hessian(detector, images: LabelledImages, generator, step: float, rtol: float) -> None:
+    """Compare the loss's Hessian product with central differences of gradients, and its jvp with the gradient."""
+    backbone, trainable = detector.split(noisy(detector.init(generator), generator))
+    cached, rows = CachedSet.of(detector, backbone, images), torch.arange(len(images))
+
+    def slope(theta, create_graph=False):
+        point = theta if theta.requires_grad else theta.detach().requires_grad_()
+        loss = cached.losses(unflatten(point, trainable), rows).mean()
+        return torch.autograd.grad(loss, point, create_graph=create_graph)[0]
+
+    theta = flatten(trainable).requires_grad_()
+    along = torch.randn(theta.shape, generator=generator, dtype=theta.dtype)
+    (product,) = torch.autograd.grad(slope(theta, create_graph=True), theta, along)
+    difference = [(slope(theta + h * along) - slope(theta - h * along)) / (2 * h) for h in (2 * step, step)]
+    extrapolated = (4 * difference[1] - difference[0]) / 3
+    assert float((product - extrapolated).norm()) < rtol * float(product.norm())
+    jvp = torch.func.jvp(lambda p: cached.losses(p, rows), (trainable,), (unflatten(along, trainable),))[1]
+    assert float(jvp.mean()) == pytest.approx(float(slope(theta) @ along), rel=1e-10)
+
+
+def check_model_files(make, names, folder: Path, generator) -> tuple[SavedDetector, float]:
+    """Compare detections after a round trip through files, to the bit; return what was read, and ONNX's difference."""
+    detector = make(num_classes=len(names), image_size=(48, 64))
+    params = {
+        name: value + 0.2 * torch.randn(value.shape, generator=generator)
+        for name, value in detector.init(generator).items()
+    }
+    saved = SavedDetector(make, params, names, (48, 64))
+    again = SavedDetector.load(saved.save(folder))
+    images = torch.rand(4, 3, 48, 64, generator=generator)
+    found = (
+        each.predict(held, images) for each, held in ((detector, params), (again.detector, again.params))
+    )
+    for ours, theirs in zip(*found, strict=True):
+        assert len(ours["scores"]) and all(torch.equal(ours[key], theirs[key]) for key in ours)
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    return again, largest_difference(saved, export(saved, folder / "model.onnx"), images)
+
+
 def configured(name: str):
     """A choice of ``detector=...``, still without classes and image size."""
     return instantiate(composed(f"detector={name}").detector)
@@ -84,5 +130,7 @@ def tools():
         double = staticmethod(as_double)
         noisy = staticmethod(noisy)
         mean_loss = staticmethod(mean_loss)
+        check_hessian = staticmethod(check_hessian)
+        check_model_files = staticmethod(check_model_files)
 
     return Tools

@@ -7,14 +7,11 @@ import torch
 from torch.nn import functional as F
 from torchvision.models import resnet18
 
-from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.losses import IGNORED
-from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
-from neural_sim.detector.saved_detector import SavedDetector
+from neural_sim.detector.onnx_export import TOLERANCE, export
 from neural_sim.detector.settings import Backbone
 from neural_sim.detector.training import Optimisation, train_detector
-from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import LabelledImages
 
 
@@ -93,23 +90,7 @@ def test_an_image_s_prediction_is_its_best_class_with_its_probability(tools, gen
 
 
 def test_hessian_products_are_central_differences_of_gradients(tools, generator):
-    detector, images = make(), shown()
-    backbone, trainable = detector.split(tools.noisy(detector.init(generator), generator))
-    cached, rows = CachedSet.of(detector, backbone, images), torch.arange(len(images))
-
-    def slope(theta, create_graph=False):
-        point = theta if theta.requires_grad else theta.detach().requires_grad_()
-        loss = cached.losses(unflatten(point, trainable), rows).mean()
-        return torch.autograd.grad(loss, point, create_graph=create_graph)[0]
-
-    theta = flatten(trainable).requires_grad_()
-    along = torch.randn(theta.shape, generator=generator, dtype=theta.dtype)
-    (product,) = torch.autograd.grad(slope(theta, create_graph=True), theta, along)
-    difference = [(slope(theta + h * along) - slope(theta - h * along)) / (2 * h) for h in (2e-4, 1e-4)]
-    extrapolated = (4 * difference[1] - difference[0]) / 3
-    assert float((product - extrapolated).norm()) < 1e-7 * float(product.norm())
-    jvp = torch.func.jvp(lambda p: cached.losses(p, rows), (trainable,), (unflatten(along, trainable),))[1]
-    assert float(jvp.mean()) == pytest.approx(float(slope(theta) @ along), rel=1e-10)
+    tools.check_hessian(make(), shown(), generator, 1e-4, 1e-7)
 
 
 def test_it_learns_colours(tools):
@@ -159,22 +140,7 @@ def test_images_without_rows_for_boxes_have_no_class():
 
 
 def test_a_model_file_and_onnx_give_the_same(tools, generator, tmp_path):
-    build = functools.partial(tools.configured("classifier"), backbone=Backbone("micro"))
-    detector = build(num_classes=3, image_size=(48, 64))
-    params = {
-        name: value + 0.2 * torch.randn(value.shape, generator=generator)
-        for name, value in detector.init(generator).items()
-    }
-    saved = SavedDetector(build, params, ("can", "mug", "bowl"), (48, 64))
-    again = SavedDetector.load(saved.save(tmp_path))
-    images = torch.rand(4, 3, 48, 64, generator=generator)
-    assert again.detector.score == "accuracy"
-    for ours, theirs in zip(
-        detector.predict(params, images), again.detector.predict(again.params, images), strict=True
-    ):
-        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-    pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    path = export(saved, tmp_path / "model.onnx")
-    assert largest_difference(saved, path, images) <= TOLERANCE
+    make = functools.partial(tools.configured("classifier"), backbone=Backbone("micro"))
+    saved, difference = tools.check_model_files(make, ("can", "mug", "bowl"), tmp_path, generator)
+    assert saved.detector.score == "accuracy" and difference <= TOLERANCE
     export(saved, tmp_path / "detections.onnx", nms=True)

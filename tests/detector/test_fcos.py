@@ -9,16 +9,12 @@ from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.fcos import FCOS, FCOSHead
 from torchvision.ops import generalized_box_iou_loss
 
-from neural_sim.detector.cached_set import CachedSet
 from neural_sim.detector.fcos import Fcos, generalised_iou
 from neural_sim.detector.losses import BACKGROUND
-from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
-from neural_sim.detector.saved_detector import SavedDetector
+from neural_sim.detector.onnx_export import TOLERANCE
 from neural_sim.detector.settings import Backbone, Detections, Head, Points
 from neural_sim.detector.smooth_scores import SmoothAP
 from neural_sim.detector.training import Optimisation, train_detector
-from neural_sim.extras import require
-from neural_sim.solver.operator import flatten, unflatten
 
 SIZE = 64
 
@@ -129,24 +125,7 @@ def test_predict_is_torchvisions(tools, generator):
 
 
 def test_hessian_products_are_central_differences_of_gradients(tools, generator):
-    detector, images = make_fcos(), large_boxes(tools)
-    backbone, trainable = detector.split(tools.noisy(detector.init(generator), generator))
-    cached = CachedSet.of(detector, backbone, images)
-    rows = torch.arange(len(images))
-
-    def slope(theta, create_graph=False):
-        point = theta if theta.requires_grad else theta.detach().requires_grad_()
-        loss = cached.losses(unflatten(point, trainable), rows).mean()
-        return torch.autograd.grad(loss, point, create_graph=create_graph)[0]
-
-    theta = flatten(trainable).requires_grad_()
-    along = torch.randn(theta.shape, generator=generator, dtype=theta.dtype)
-    (product,) = torch.autograd.grad(slope(theta, create_graph=True), theta, along)
-    difference = [(slope(theta + h * along) - slope(theta - h * along)) / (2 * h) for h in (2e-5, 1e-5)]
-    extrapolated = (4 * difference[1] - difference[0]) / 3
-    assert float((product - extrapolated).norm()) < 1e-6 * float(product.norm())
-    jvp = torch.func.jvp(lambda p: cached.losses(p, rows), (trainable,), (unflatten(along, trainable),))[1]
-    assert float(jvp.mean()) == pytest.approx(float(slope(theta) @ along), rel=1e-10)
+    tools.check_hessian(make_fcos(), large_boxes(tools), generator, 1e-5, 1e-6)
 
 
 def test_smooth_ap_falls_along_its_gradient(tools, generator):
@@ -219,20 +198,5 @@ def test_labels_and_boxes_that_cannot_be_are_refused():
 
 def test_a_model_file_and_onnx_give_the_same(tools, generator, tmp_path):
     make = functools.partial(tools.configured("fcos"), backbone=Backbone("micro"), head=Head(8, 1, prior=0.3))
-    detector = make(num_classes=2, image_size=(48, 64))
-    params = {
-        name: value + 0.2 * torch.randn(value.shape, generator=generator)
-        for name, value in detector.init(generator).items()
-    }
-    saved = SavedDetector(make, params, ("can", "mug"), (48, 64))
-    again = SavedDetector.load(saved.save(tmp_path))
-    images = torch.rand(4, 3, 48, 64, generator=generator)
-    for ours, theirs in zip(
-        detector.predict(params, images), again.detector.predict(again.params, images), strict=True
-    ):
-        assert len(ours["scores"]) and all(torch.equal(ours[key], theirs[key]) for key in ours)
-    pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    require("onnx", "model.onnx")
-    path = export(saved, tmp_path / "model.onnx")
-    assert 0.0 < largest_difference(saved, path, images) <= TOLERANCE
+    _, difference = tools.check_model_files(make, ("can", "mug"), tmp_path, generator)
+    assert 0.0 < difference <= TOLERANCE
