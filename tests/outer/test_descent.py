@@ -263,6 +263,9 @@ def test_an_object_that_was_read_takes_no_step_along_a_derivative_unless_a_train
     assert learned.records[0].verdicts["a"].accepted == right and len(learned.records) == 3
     _, tried, *_ = learned.trajectory
     assert torch.equal(tried[0], psi[0].double()) == right and bool(tried[1].any())
+    assert set(learned.records[0].certificate.actions) == (
+        {"b"} if right else {"a", "b"}
+    )  # b alone still moves
 
 
 @pytest.mark.parametrize("psi", [torch.zeros(2, 4), THERE], ids=["stay", "move"])

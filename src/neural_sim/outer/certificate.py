@@ -133,8 +133,8 @@ class Certificate:
         doubts: names of the failed conditions on the whole hypergradient.
         p_values: p-values, by object and factor, of the null hypothesis that the derivative is zero. They test this
             iteration's derivative or, for trust-region steps, the average over iterations that the steps follow.
-        actions: what happens to the learned objects' steps. A step is ``kept`` if no condition fails and its derivative
-            is significant. ``waiting`` then marks the steps that wait.
+        actions: what happens to the steps of the objects whose psi is not settled. A step is ``kept`` if no condition
+            fails and its derivative is significant. ``waiting`` then marks the steps that wait.
     """
 
     adjoint: Quality | None
@@ -163,6 +163,10 @@ class Certificate:
             for name, by_factor in self.actions.items()
         }
         return replace(self, actions=actions)
+
+    def without(self, names: Collection[str]) -> Certificate:
+        """Leave out what happens to the named objects, whose psi is settled."""
+        return replace(self, actions={name: a for name, a in self.actions.items() if name not in names})
 
     @property
     def _taken(self) -> set[Action]:

@@ -72,7 +72,7 @@ class GradientLoop(OuterLoop, ABC):
         self._recording: Recording | None = None
         self._before = psi.new_zeros(0, 0)
         self._way = Way.begin(self.objects.names, start)
-        self._offered = False
+        self._offered, self._settled = False, frozenset[str]()
         self._folds: list[Objective] = []
         self._before_folds = generator.get_state()
         self._stopped = False
@@ -138,7 +138,7 @@ class GradientLoop(OuterLoop, ABC):
         if settled and isinstance(steps, TrustRegionSteps):
             self._stopped = settled >= set(self.objects.names)
             self.steps = steps.held(settled)
-            self._way = self._way.settled(settled)
+            self._way, self._settled = self._way.settled(settled), frozenset(settled)
 
     def _trained_once(self) -> Trained:
         """Train at psi, to record its score."""
@@ -215,7 +215,7 @@ class GradientLoop(OuterLoop, ABC):
             cosine,
         )
         self.steps = self.steps.propose(certificate, trust.shrink)
-        return certificate.waiting(self.steps.waiting)
+        return certificate.waiting(self.steps.waiting).without(self._settled)
 
     @property
     def _certifies(self) -> bool:
@@ -258,6 +258,7 @@ class GradientLoop(OuterLoop, ABC):
             "before": self._before,
             "way": dict(self._way.stays),
             "offered": self._offered,
+            "settled": sorted(self._settled),
             "folds": len(self._folds),
             "before_folds": self._before_folds,
             "stopped": self._stopped,
@@ -274,7 +275,8 @@ class GradientLoop(OuterLoop, ABC):
         super().restore(state)
         self.steps = replace(self.steps, **state["steps"])  # pyright: ignore[reportArgumentType]
         self._before, self._way = state["before"], Way(state["way"])
-        self._offered, self._stopped, self._idle = state["offered"], state["stopped"], state["idle"]
+        self._offered, self._settled = state["offered"], frozenset(state["settled"])
+        self._stopped, self._idle = state["stopped"], state["idle"]
 
     def _prepare(self) -> None:
         """Draw what the derivative needs in addition to the training images."""
