@@ -9,6 +9,7 @@ from typing import Any
 import jaxtyping
 import pytest
 import shape_checking
+from filelock import FileLock
 
 shape_checking.install()  # before anything imports the package
 
@@ -61,11 +62,18 @@ def pretend():
 
 @pytest.fixture(scope="session")
 def empty_store(tmp_path_factory) -> Path:
-    """An MLflow store without runs, to be copied: its tables take ten seconds to make."""
+    """An MLflow store without runs, to be copied: its tables take ten seconds to make. Processes that share the tests
+    share it, too."""
     from neural_sim.report.tracking import connect, tracking_uri
 
-    path = tmp_path_factory.mktemp("store") / "mlflow.db"
-    connect(tracking_uri(str(path)))
+    own = tmp_path_factory.getbasetemp()
+    path = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "empty" / "mlflow.db"
+    with FileLock(path.parents[1] / "empty.lock"):
+        if not path.exists():
+            made = tmp_path_factory.mktemp("store") / "mlflow.db"
+            connect(tracking_uri(str(made)))
+            path.parent.mkdir()
+            made.rename(path)
     return path
 
 

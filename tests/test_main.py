@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -27,7 +28,8 @@ def _run(folder, *arguments):
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
 
 
-def test_one_run_from_objects_to_a_report(tmp_path):
+def test_one_run_from_objects_to_a_report(tmp_path, empty_store):
+    shutil.copy(empty_store, tmp_path / "mlflow.db")
     done = _run(tmp_path, "+experiment=pose_gap", "scale=smoke", "progress=false")
     assert done.returncode == 0, done.stderr[-3000:]
     assert "its scores mean nothing" in done.stdout

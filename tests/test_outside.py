@@ -107,7 +107,7 @@ def test_a_target_is_parted_letterboxed_and_keyed_like_all_others(tmp_path):
         build(outside(*words, "target.val_fraction=1.5"))
 
 
-@pytest.mark.parametrize("adjoint", ["implicit", "unrolled"])
+@pytest.mark.parametrize("adjoint", [pytest.param("implicit", marks=pytest.mark.slow), "unrolled"])
 def test_they_run_together(adjoint, tmp_path):
     config = outside(
         *MINE.values(), "objects.names=[can,mug]", "stages=[views,field,target_sets,warm_start,psi,evaluate]",

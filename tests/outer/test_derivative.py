@@ -137,9 +137,12 @@ def test_unrolling_wants_a_training_in_every_iteration(settings):
         Outer(steps=FreeSteps(), **settings)
 
 
-@pytest.mark.parametrize("adjoint", [Unrolled(), Implicit()], ids=lambda a: type(a).__name__)
 @pytest.mark.parametrize(
-    ("kind", "estimator"), [("fcos", ESTIMATORS[2]), *(("classifier", each) for each in ESTIMATORS)]
+    ("kind", "estimator", "adjoint"),
+    [
+        *(("fcos", ESTIMATORS[2], adjoint) for adjoint in (Unrolled(), Implicit())),
+        *zip(["classifier"] * 4, ESTIMATORS, [Unrolled(), Implicit(), Unrolled(), Implicit()], strict=True),
+    ],
 )
 def test_detectors_of_other_kinds_go_through_the_same_loop(scene, adjoint, kind, estimator):
     """With checked steps, and the smooth score as the objective: AP, whose ranks count FCOS's centre-ness, or a

@@ -143,13 +143,15 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
 
 
 @pytest.mark.parametrize(
-    "adjoint", [Implicit(curvature_images=4), Unrolled()], ids=lambda a: type(a).__name__
+    ("estimator", "adjoint"),
+    [
+        (StratifiedEstimator(2), Unrolled()),
+        (PathwiseEstimator(), Implicit(curvature_images=4)),
+        (PathwiseEstimator("reverse"), Unrolled()),
+        (ReinforceEstimator(), Implicit(curvature_images=4)),
+    ],
+    ids=lambda value: type(value).__name__ + getattr(value, "mode", ""),
 )
-@pytest.mark.parametrize(
-    "estimator",
-    [StratifiedEstimator(2), PathwiseEstimator(), PathwiseEstimator("reverse"), ReinforceEstimator()],
-    ids=lambda e: type(e).__name__ + getattr(e, "mode", ""),
-)  # fmt: skip
 def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estimator, adjoint):
     scene = _scene(parameters=[Pose(bins=3), Illumination(anchors=ANCHORS)])
     generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"])

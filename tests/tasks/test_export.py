@@ -2,9 +2,6 @@
 
 import functools
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +18,6 @@ from neural_sim.target.coco import CocoTarget
 from neural_sim.tasks import export as task
 from neural_sim.tasks.walk import walk
 
-ROOT = Path(__file__).parents[2]
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "stages=[export]", "objects.names=[pitcher,drill]",
     "views.count=8", "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64",
@@ -194,17 +190,6 @@ def test_another_configuration_of_a_folder_is_refused_before_fields_are_fitted(
                             ("export.psi=initial", r"made with psi\.pitcher\.pose=")):  # fmt: skip
         with pytest.raises(ValueError, match=rf"export\.folder: .*{message}"):
             export(base, tmp_path, f"export.folder={made}", "export.formats=[coco,yolo,bop]", change)
-
-
-def test_on_the_command_line_bad_settings_end_with_status_two(base, tmp_path):
-    words = [*SMALL, f"paths.store={base / 'store'}", "export.formats=[voc]", f"hydra.run.dir={tmp_path}/run"]
-    done = subprocess.run(
-        [sys.executable, "-m", "src.main", *words], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith(
-        "neural-sim: export.formats[0]: want one of coco, yolo, bop"
-    )
 
 
 def test_views_for_larger_images_have_as_many_pixels_for_a_radius(base):
