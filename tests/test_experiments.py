@@ -60,8 +60,11 @@ def test_every_experiment_composes_and_builds(name, shared):
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_jobs_of_a_study_are_settings_of_their_own_and_the_last_builds(name, shared):
-    jobs = [job for job in _jobs(name) if "seed=0" in job and "baseline=lts" not in job]
-    settings = []
+    """Composed with the method of all studies; the others differ from it by their names."""
+    every = [job for job in _jobs(name) if "seed=0" in job]
+    jobs, settings = [job for job in every if "baseline=neural_sim" in job], []
+    methods = {word for job in every for word in job if word.startswith("baseline=")}
+    assert len(every) == len(jobs) * len(methods)
     for job in jobs:
         config = composed(*job)
         parameters = {
@@ -69,8 +72,8 @@ def test_jobs_of_a_study_are_settings_of_their_own_and_the_last_builds(name, sha
         }
         varied = (repr(parameters), repr(config.training.real))
         settings.append((config.name, config.gap, config.baseline.name, *varied))
-    assert len(jobs) > 1 and len(set(settings)) == len(jobs)
-    assert made(*jobs[-1], f"paths.data={shared}").experiment.run.name == settings[-1][0]
+    assert len(every) > 1 and len(set(settings)) == len(jobs)
+    assert made(*every[-1], f"paths.data={shared}").experiment.run.name == settings[-1][0]
 
 
 @pytest.mark.parametrize("name", [n for n in OWN if n not in (*STUDIES, "photographs")])

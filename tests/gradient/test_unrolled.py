@@ -128,7 +128,7 @@ def test_blocks_of_steps_grow_and_weigh_what_they_stand_for(generator):
     assert ((drawn.double().mean(0) - 1.0).abs() <= 4.0 * error).all()
 
 
-@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_standard_error_counts_the_probes_and_the_few_that_are_scored(generator, every):
     """Losses linear in theta, whose scores are products with a_t: their slopes vary around each bin's own.
 

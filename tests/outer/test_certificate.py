@@ -119,6 +119,7 @@ def test_only_objects_that_move_have_actions_and_what_was_not_tested_is_kept():
     assert certificate.actions == {"b": {"pose": "kept"}} and certificate.p_values == {}
 
 
+@pytest.mark.slow
 def test_of_six_objects_that_know_nothing_and_one_that_does_the_one_is_kept(generator):
     """The default estimator's own p-values, 50 iterations: noise is kept with the probability that the level says."""
     each, level, runs = 16, 0.05, 50

@@ -106,7 +106,8 @@ def noisy_way(generator, gains, scatter, objects=6):
 @pytest.mark.parametrize(
     ("gains", "better"),
     [
-        ([0.0, 0.05, 0.03, 0.02, 0.015, 0.01, 0.005], 0.0),  # steps that gain: hardly anything to take back
+        # Steps that gain: hardly anything to take back.
+        pytest.param([0.0, 0.05, 0.03, 0.02, 0.015, 0.01, 0.005], 0.0, marks=pytest.mark.slow),
         ([0.0] * 7, 0.005),  # coin tosses
         ([0.0, 0.2, 0.03, 0.01, -0.015, -0.015, -0.015], 0.03),  # losses that single trainings do not show
     ],

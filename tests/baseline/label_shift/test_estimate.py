@@ -287,7 +287,7 @@ def lit(name, distribution, weights):
     return PooledSubject(name, maps, draw, len(weights))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_weights_of_lights_are_read_in_the_same_interface(seed):
     """Other renders, other images of the target, another network: the same weights."""
     distribution, generator = (
