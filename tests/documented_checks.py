@@ -18,6 +18,7 @@ def check_of(config):
         "export": _export,
         "preflight": _preflight,
         "repeat": _repeat,
+        "sample": _sample,
         "viewer": _viewer,
     }
     alone = stages.get(config["stages"][-1])
@@ -141,6 +142,13 @@ def _repeat(folder, config):
     assert "trainings of each distribution" in text and all(
         f"| {name} |" in text for name in everything["names"]
     )
+
+
+def _sample(folder, config):
+    """tutorial.md: what it needs."""
+    made = Path(config["sample"]["folder"])
+    assert {path.name for path in (made / "captures").iterdir()} == set(config["objects"]["names"])
+    assert json.loads((made / "labels.json").read_text())["annotations"] and any((made / "new").iterdir())
 
 
 def _viewer(folder, config):

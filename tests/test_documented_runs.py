@@ -49,6 +49,8 @@ class Runs:
         few = ["export.count=3", "export.width=64", "export.height=48"] if _exports(command) else []
         if "stages=[viewer]" in command.overrides:
             kept.append("viewer.seconds=1")
+        if "+experiment=sample_data" in command.overrides:
+            kept.append(f"sample.folder={self.root / 'shelf'}")
         if few:  # into folders of the test's own
             kept = [f"export.folder={self.root / 'exported'}" if "folder=" in word else word for word in kept]
         return [*kept, *few, "scale=smoke"]

@@ -31,6 +31,16 @@ MISTAKES = [  # what is typed, where {here} is an empty folder, and what the lin
     ("objects=photos", "objects.root is not given: want a folder that holds a folder for each object, "),
     ("outer.iterations=0", "outer.iterations: want at least 1, got 0"),
     ("export export.width=640", "export: want width and height or neither, got 640 and None"),
+    ("--scale smoke", "--scale smoke: want scale=smoke, without dashes"),
+    ("demo --scale=smoke", "--scale=smoke: want scale=smoke, without dashes"),
+    ("demo --smoke", "--smoke: no such flag; want scale=smoke"),
+    ("demo -seed=1", "-seed=1: want seed=1, without dashes"),
+    ("demo --verbose", "--verbose: no such flag; want key=value, such as seed=1, or --help"),
+    ("demo smoke", "smoke: want scale=smoke"),
+    ("learnn", "learnn: no such command or experiment; did you mean learn?"),
+    ("viewer", "viewer: no such command or experiment; did you mean view?"),
+    ("objekts=photos", "objekts: unknown key; did you mean objects?"),
+    ("objects=photo", "objects=photo: no such choice; did you mean objects=photos?"),
     ("predict", "predict.images: want a folder of pictures, a glob or a picture, got null"),
 ]  # fmt: skip
 

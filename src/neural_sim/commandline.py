@@ -30,6 +30,7 @@ PATHS = {
 }
 """Keys whose values are paths of a user's own data, and what each path must be."""
 WITH_VALUE = (*FOLDERS, "--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun")
+FLAGS = (*WITH_VALUE, "--multirun", "-m", "--run", "-r", "--resolve", "--help", "-h", "--version")
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,10 @@ def checked(words: Sequence[str], layout: Layout, commands: Iterable[str] = ()) 
         UserError: a word is not a setting, or names an unknown group, choice or top-level key.
     """
     skipped = False
-    for word in words:
+    for word, after in zip(words, (*words[1:], ""), strict=False):
         if skipped or word.startswith("-"):
+            if not skipped and word.partition("=")[0] not in FLAGS:
+                raise UserError(_no_flag(word, after, layout))
             skipped = not skipped and word in WITH_VALUE
             continue
         name = word.lstrip("+~")
@@ -189,6 +192,23 @@ def _declared(word: str, key: str, value: str) -> bool:
     return word.startswith("+") and (key.endswith("._target_") or "_target_" in value)
 
 
+def _no_flag(word: str, after: str, layout: Layout) -> str:
+    """Say what to type instead of ``--scale smoke``, ``--scale=smoke`` or ``--smoke``."""
+    name, equals, value = word.lstrip("-").partition("=")
+    name = name if name in layout.keys else name.replace("-", "_")
+    if name in layout.groups or name in layout.keys:
+        value = value or after or "..."
+        return f"{word}{'' if equals or not after else f' {after}'}: want {name}={value}, without dashes"
+    chosen = _choosing(name, layout)
+    meant = f"; want {' or '.join(chosen)}" if chosen else _meant(name, layout.top)
+    return f"{word}: no such flag{meant or '; want key=value, such as seed=1, or --help'}"
+
+
+def _choosing(word: str, layout: Layout) -> list[str]:
+    """Return the settings that choose ``word``."""
+    return [f"{group}={word}" for group, choices in layout.groups.items() if word in choices]
+
+
 def _no_setting(word: str, layout: Layout, commands: Iterable[str]) -> str:
     if word in layout.groups.get("experiment", ()):
         return f"{word}: want +experiment={word}"
@@ -196,6 +216,8 @@ def _no_setting(word: str, layout: Layout, commands: Iterable[str]) -> str:
         return f"{word}: want {word}= and one of {', '.join(layout.groups[word])}"
     if re.fullmatch(r"[\d.]+", word):
         return f"{word}: want key=value; values of a sweep are joined by commas, such as -m seed=0,1,2"
+    if chosen := _choosing(word, layout):
+        return f"{word}: want {' or '.join(chosen)}"
     meant = _meant(word, {*commands, *layout.groups.get("experiment", ())})
     if meant and " " not in word:
         return f"{word}: no such command or experiment{meant}"

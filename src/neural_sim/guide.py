@@ -121,6 +121,11 @@ VERBS = {
         ("compare.experiments", "compare.clock", "paths.mlflow"),
         "'compare.experiments=[pose_gap]'",
     ),
+    "sample": Verb(
+        "write data to try the commands with: captures, meshes and labelled pictures",
+        ("+experiment=sample_data",),
+        ("sample.folder", "objects.names", "views.count", "target.val_per_object", "seed"),
+    ),
     "doctor": Verb(
         "check packages, device, memory, OpenGL, the store's results, MLflow and data",
         ("stages=[doctor]",),
@@ -137,13 +142,14 @@ def spoken(words: Sequence[str]) -> list[str]:
 
 
 def answer(words: Sequence[str], layout: Layout) -> str | None:
-    """Answer ``--version``, ``--help``, ``COMMAND --help`` and ``--help keys``; None for other words."""
+    """Answer ``--version``, ``--help`` or ``help``, ``COMMAND --help`` and ``--help keys``; None for other words."""
     if "--version" in words:
         return f"neural-sim {neural_sim.__version__}"
-    if not {"--help", "-h"} & set(words):
+    if not {"--help", "-h"} & set(words) and words[:1] != ["help"]:
         return None
-    if words[0] in VERBS:
-        return _help_of(words[0], layout)
+    named = [word for word in words[:2] if word in VERBS]
+    if named:
+        return _help_of(named[0], layout)
     return _all_keys(layout) if words[-1] == "keys" else _help(layout)
 
 

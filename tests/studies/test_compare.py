@@ -167,6 +167,36 @@ def test_no_comparable_run_is_refused_with_the_reasons(database, tmp_path):
         compared(database, tmp_path, draws=5, methods=("typo",))
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("results.json", '{"method": "lts", "se', r"results\.json: not readable as JSON"),
+        ("results.json", "[]", r"its results\.json holds no results of a run"),
+        ("detections.json", "", r"lts seed 0 \(\w{8}\) of gap: \S+detections\.json: not readable as JSON"),
+        ("detections.json", '{"images": 8}', r"detections\.json: want the images, truth and detections of a run"),
+        ("detections.json", '{"images": 0, "truth": []}', r"detections\.json: want the images, truth and"),
+    ],
+)  # fmt: skip
+def test_a_damaged_file_of_a_run_is_named(name, content, said, context, tmp_path):
+    """Without its results a run is left out; detections are read only of what is compared, which needs them."""
+    for method in ("neural_sim", "lts"):
+        run = tmp_path / method
+        run.mkdir()
+        (run / "results.json").write_text(json.dumps(results(method, 0, 0.5)))
+        (run / "detections.json").write_text(json.dumps(detections(4)))
+        if method == "lts":
+            (run / name).write_text(content)
+        log_files(context.uri, f"{method} seed 0", run)
+    if name == "detections.json":
+        with pytest.raises(ValueError, match=said) as refused:
+            compared(context.uri, tmp_path / "compare", draws=5)
+        assert "\n" not in str(refused.value)
+        return
+    compared(context.uri, tmp_path / "compare", draws=5)
+    (left,) = json.loads((tmp_path / "compare" / "compare.json").read_text())["left_out"]
+    assert left["run"] == "lts seed 0" and re.search(said, left["reason"])
+
+
 def test_seconds_of_several_kinds_of_device_are_called_so(context, tmp_path):
     for method, kind in (("neural_sim", "gpu"), ("lts", "cpu")):
         run = tmp_path / method

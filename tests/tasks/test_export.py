@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -212,13 +213,19 @@ def test_a_finer_recipe_has_more_steps_and_cells_and_may_be_fitted(base):
     assert torch.is_tensor(fitting.field.table)
 
 
-def test_what_finer_fields_cost_is_said_before_they_are_fitted(made, base):
-    """Nothing is to be said where the run's own fields serve."""
-    context, _ = context_of(small(base), base / "unused")
+def test_what_finer_fields_cost_is_said_before_they_are_fitted(made, base, tmp_path):
+    """Those that the store has cost nothing; nothing is to be said where the run's own fields serve."""
+    shutil.copytree(base / "store", tmp_path / "store")
+    context, _ = context_of(small(base, f"paths.store={tmp_path / 'store'}"), base / "unused")
     graph, results = context.graph, context.results
     finer = finer_fields(graph, reframed(graph.camera, 384, 384), 192)
     assert cost_of(finer, graph.fields, results) == (
         "2 finer fields to fit first, each with 4.0 times the steps and 16 times the pixels of a field of the run; "
         "export.detail=run uses the run's fields instead"
     )
+    left = [cost_of(finer, graph.fields, results)]
+    for stage in finer:
+        results.store.fetch(stage.kind, stage.key, stage.description, lambda: {"fitted": 1})
+        left.append(cost_of(finer, graph.fields, results))
+    assert [said.split(" to fit")[0] for said in left] == ["2 finer fields", "1 finer field", ""]
     assert cost_of(graph.fields, graph.fields, results) == ""

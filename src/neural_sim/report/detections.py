@@ -68,12 +68,19 @@ def write_detections(
 
 
 def read_detections(file: Path) -> tuple[LabelledImages, dict[str, list[Detections]]]:
-    """Read detections.json: the test set without pixels, and the detections of every detector."""
+    """Read detections.json: the test set without pixels, and the detections of every detector.
+
+    Raises:
+        ValueError: a file that is no JSON or holds something else, with its path.
+    """
     stored = read_json(file)
-    count = stored.pop("images")
-    by_image = {which: _by_image(rows, count) for which, rows in stored.items()}
-    truth = by_image.pop("truth")
-    return without_pixels([(image["boxes"], image["labels"]) for image in truth]), by_image
+    try:
+        count = stored.pop("images")
+        by_image = {which: _by_image(rows, count) for which, rows in stored.items()}
+        truth = by_image.pop("truth")
+        return without_pixels([(image["boxes"], image["labels"]) for image in truth]), by_image
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{file}: want the images, truth and detections of a run ({error!r})") from error
 
 
 def _by_image(rows: Sequence[Mapping[str, Any]], count: int) -> list[Detections]:

@@ -254,19 +254,24 @@ def _read(run: tracking.LoggedRun, experiment: str) -> FinishedRun:
     for file in (RESULTS, DETECTIONS):
         if file not in run.files:
             return replace(known, unusable=f"it was not evaluated: it left no {file}")
-    results = read_json(run.fetch(RESULTS))
-    return replace(known, results=results, read=lambda: read_outcomes(results, run.fetch(DETECTIONS)))
+    try:
+        results = read_json(run.fetch(RESULTS))
+    except ValueError as error:
+        return replace(known, unusable=str(error))
+    if not isinstance(results, Mapping):
+        return replace(known, unusable=f"its {RESULTS} holds no results of a run")
+    return replace(known, results=results, read=lambda: _outcomes(known, results, run.fetch(DETECTIONS)))
 
 
-def read_outcomes(results: Mapping[str, Any], file: Path) -> dict[str, list[Outcomes]]:
-    """Match a run's detections to the test set's boxes, for each of its biased objects.
-
-    Args:
-        results: the content of results.json.
-        file: detections.json.
-    """
+def _outcomes(run: FinishedRun, results: Mapping[str, Any], file: Path) -> dict[str, list[Outcomes]]:
+    """Match a run's detections in ``file`` to the test set's boxes, for each of its biased objects."""
     names = list(results["psi"])
-    truth, detections = read_detections(file)
+    try:
+        truth, detections = read_detections(file)
+    except ValueError as error:
+        raise ValueError(
+            f"{run.label} of {run.experiment}: {error}; restore the file or delete the run"
+        ) from error
     score: Score = results.get("score", "AP")
     labels = [names.index(name) for name in results["biased"]]
     return {which: [match(own, truth, label, score) for label in labels] for which, own in detections.items()}

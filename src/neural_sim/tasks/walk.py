@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +13,7 @@ from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.baseline.label_shift.settings import LabelShift
-from neural_sim.documents import parsed_json
 from neural_sim.outer.inner import pooled
-from neural_sim.outer.progress import duration
 from neural_sim.parameter.product import HardDraws
 from neural_sim.report.page.objects import ShownObject, write_objects_page
 from neural_sim.report.run_tracking import LiveRun
@@ -23,6 +21,7 @@ from neural_sim.stages.account import Omission
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Task
+from neural_sim.tasks.forecast import forecast
 from neural_sim.tasks.report import ReportTask
 
 _log = logging.getLogger(__name__)
@@ -137,10 +136,11 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
         warn_of_uncovered(context.graph)
     wanted = [stage for task in tasks.values() for stage in task.reads(context)]
     if wanted:
-        missing = Counter(stage.phase for stage in context.results.check(wanted) if stage.stored)
+        missing = [stage for stage in context.results.check(wanted) if stage.stored]
+        counts = Counter(stage.phase for stage in missing)
         _log.info(
             "to make: %s%s",
-            ", ".join(f"{phase} {count}" for phase, count in missing.items()) or "nothing",
+            ", ".join(f"{phase} {count}" for phase, count in counts.items()) or "nothing",
             forecast(context, missing),
         )
     if phases:
@@ -157,29 +157,6 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
         return None
     # Psi was learned on val, so this score is for choosing settings, never for reporting. It uses no test images.
     return context.results(context.graph.validation(context.results(context.graph.learned))).ap.mean
-
-
-def forecast(context: Context, phases: Collection[str]) -> str:
-    """Return how long the phases took in the last run of this name, scale and method; empty if there is none.
-
-    Results that the earlier run found in the store count with the time that they took to compute.
-    """
-    files = sorted(context.folder.parent.glob("*/results.json"), key=lambda path: -path.stat().st_mtime)
-    alike = {"scale": context.scale, "method": context.experiment.loop.method.name}
-    for path in files if context.scale else ():
-        try:
-            held = parsed_json(path.read_text(encoding="utf-8"))
-            if any(held.get(key) != value for key, value in alike.items()):
-                continue
-            spent = {phase: held["seconds"].get(phase, 0.0) for phase in phases}
-            for found in held["left_out"]:
-                if found["stage"] in spent:
-                    spent[found["stage"]] += found["seconds"] or 0.0
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):  # a file of an older version
-            continue
-        if all(spent.values()):
-            return f": about {duration(sum(spent.values()))}, as on {held['date']}" if spent else ""
-    return ""
 
 
 def warn_of_uncovered(graph: Graph) -> None:

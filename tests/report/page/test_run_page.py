@@ -179,7 +179,7 @@ def test_a_browser_shows_the_page_without_a_sideways_scroll(results, shown, tmp_
     page = RunPage(results, shown).write(COMMANDS, tmp_path)
     probe = "<script>document.title = [innerWidth, document.documentElement.scrollWidth, document.images.length, " \
         "[...document.images].filter(i => i.naturalWidth).length].join()</script></body>"  # fmt: skip
-    page.write_text(page.read_text().replace("</body>", probe).replace('loading="lazy"', ""))
+    page.write_text(page.read_text().replace("</body>", probe))
     command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900", "--dump-dom",
                "--virtual-time-budget=3000", page.as_uri()]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
