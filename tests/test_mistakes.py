@@ -7,7 +7,7 @@ import pytest
 
 from neural_sim import main as program
 
-MISTAKES = [  # what is typed, where {here} is an empty folder, and what the line must say
+MISTAKES = [  # what is typed, where {here} is a folder with an empty one, and what the line must say
     ("dmeo", "dmeo: no such command or experiment; did you mean demo?"),
     ("pose_gap", "pose_gap: want +experiment=pose_gap"),
     ("+experiment=pose_gab", "did you mean experiment=pose_gap"),
@@ -36,6 +36,15 @@ MISTAKES = [  # what is typed, where {here} is an empty folder, and what the lin
     ("demo --smoke", "--smoke: no such flag; want scale=smoke"),
     ("demo -seed=1", "-seed=1: want seed=1, without dashes"),
     ("demo --verbose", "--verbose: no such flag; want key=value, such as seed=1, or --help"),
+    ("stages=views,field", "stages=views,field: want a list, in quotes: 'stages=[views,field]'"),
+    ("stages=[views, field]", "stages=[views, field]: spaces end a setting; want quotes about it: 'stages=[views, "),
+    ("objects=photos objects.root=my photos", "want quotes about it: 'objects.root=my photos'"),
+    ("field {here}", "want objects=photos objects.root={here}, or objects=folder for meshes"),
+    ("scale = smoke", "scale =: want scale=..., without spaces"),
+    ("demo seed=0,1,2", "want -m seed=0,1,2 for a run of each value, or 'seed=[0,1,2]' for a list"),
+    ("experiment pose_gap", "experiment: want +experiment= and one of"),
+    ("demo device=cuda", "device: unknown key; want trainer=gpu or trainer=cpu"),
+    ("demo output=here", "output: unknown key; want hydra.run.dir=FOLDER"),
     ("demo smoke", "smoke: want scale=smoke"),
     ("learnn", "learnn: no such command or experiment; did you mean learn?"),
     ("viewer", "viewer: no such command or experiment; did you mean view?"),
@@ -51,6 +60,7 @@ def test_a_mistake_is_one_line_that_says_what_to_type(typed, said, tmp_path, mon
     monkeypatch.setattr(logging, "raiseExceptions", True)  # which the program sets
     here = tmp_path / "empty"
     here.mkdir()
+    (here / "my photos").mkdir()
     monkeypatch.chdir(here)
     words = [word.format(here=here) for word in typed.split()]
     places = [f"paths.store={here}/store", f"paths.mlflow={here}/mlflow.db", "hydra/job_logging=none"]
@@ -59,6 +69,10 @@ def test_a_mistake_is_one_line_that_says_what_to_type(typed, said, tmp_path, mon
         program.main()
     told = capsys.readouterr()
     assert ended.value.code == 2 and told.out == ""
-    assert told.err.startswith("neural-sim: ") and told.err.count("\n") == 1 and said in told.err
+    assert (
+        told.err.startswith("neural-sim: ")
+        and told.err.count("\n") == 1
+        and said.format(here=here) in told.err
+    )
     results = [path for path in here.rglob("*") if path.is_file() and ".hydra" not in path.parts]
     assert not results

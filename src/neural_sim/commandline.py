@@ -29,6 +29,8 @@ PATHS = {
     "predict.annotations": "a COCO file",
 }
 """Keys whose values are paths of a user's own data, and what each path must be."""
+OTHER_NAMES = {"device": "trainer=gpu or trainer=cpu", "output": "hydra.run.dir=FOLDER", "gpu": "trainer=gpu"}
+"""Words of other programs, and what says the same here."""
 WITH_VALUE = (*FOLDERS, "--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun")
 FLAGS = (*WITH_VALUE, "--multirun", "-m", "--run", "-r", "--resolve", "--help", "-h", "--version")
 
@@ -138,7 +140,7 @@ def checked(words: Sequence[str], layout: Layout, commands: Iterable[str] = ()) 
         UserError: a word is not a setting, or names an unknown group, choice or top-level key.
     """
     skipped = False
-    for word, after in zip(words, (*words[1:], ""), strict=False):
+    for before, word, after in zip(("", *words), words, (*words[1:], ""), strict=False):
         if skipped or word.startswith("-"):
             if not skipped and word.partition("=")[0] not in FLAGS:
                 raise UserError(_no_flag(word, after, layout))
@@ -147,7 +149,7 @@ def checked(words: Sequence[str], layout: Layout, commands: Iterable[str] = ()) 
         name = word.lstrip("+~")
         key, equals, value = name.partition("=")
         if not equals and not word.startswith("~"):
-            raise UserError(_no_setting(word, layout, commands))
+            raise UserError(_split(before, word, after) or _no_setting(word, layout, commands))
         if key == "hydra/launcher" and value in layout.launchers:
             require("sweeps", word)
         if key.startswith("hydra") or "@" in key:
@@ -179,6 +181,8 @@ def present(words: Sequence[str]) -> None:
 def _check_stages(word: str, value: str, layout: Layout, words: Sequence[str]) -> None:
     phases = re.findall(r"\w+", layout.keys["stages"][0].value)
     own = {other.lstrip("+").partition("=")[0].partition(".")[0] for other in words}
+    if re.fullmatch(r"[\w,-]+", value):
+        raise UserError(f"{word}: want a list, in quotes: 'stages=[{value}]'")
     for stage in re.findall(r"[\w-]+", value) if "$" not in value else ():
         if stage not in phases and stage not in layout.top | own:
             known = [*phases, *layout.tasks]
@@ -190,6 +194,17 @@ def _check_stages(word: str, value: str, layout: Layout, words: Sequence[str]) -
 def _declared(word: str, key: str, value: str) -> bool:
     """Return whether a word adds something of the user's own, such as a task."""
     return word.startswith("+") and (key.endswith("._target_") or "_target_" in value)
+
+
+def _split(before: str, word: str, after: str) -> str:
+    """Say where spaces have split a setting; empty: they have not."""
+    key, _, value = before.lstrip("+").partition("=")
+    is_open = sum(map(before.count, "[{")) > sum(map(before.count, "]}"))
+    if is_open or (key in PATHS and Path(f"{value} {word}").exists()):
+        return f"{before} {word}: spaces end a setting; want quotes about it: '{before} {word}'"
+    if after.startswith("="):
+        return f"{word} {after}: want {word}={after.lstrip('=') or '...'}, without spaces"
+    return ""
 
 
 def _no_flag(word: str, after: str, layout: Layout) -> str:
@@ -213,7 +228,8 @@ def _no_setting(word: str, layout: Layout, commands: Iterable[str]) -> str:
     if word in layout.groups.get("experiment", ()):
         return f"{word}: want +experiment={word}"
     if word in layout.groups:
-        return f"{word}: want {word}= and one of {', '.join(layout.groups[word])}"
+        plus = "" if word in layout.defaults else "+"
+        return f"{word}: want {plus}{word}= and one of {', '.join(layout.groups[word])}"
     if re.fullmatch(r"[\d.]+", word):
         return f"{word}: want key=value; values of a sweep are joined by commas, such as -m seed=0,1,2"
     if chosen := _choosing(word, layout):
@@ -221,6 +237,8 @@ def _no_setting(word: str, layout: Layout, commands: Iterable[str]) -> str:
     meant = _meant(word, {*commands, *layout.groups.get("experiment", ())})
     if meant and " " not in word:
         return f"{word}: no such command or experiment{meant}"
+    if Path(word).is_dir():
+        return f"{word}: want objects=photos objects.root={word}, or objects=folder for meshes"
     return f"{word}: want key=value, such as seed=1 (in quotes if it has spaces), or --help"
 
 
@@ -243,6 +261,10 @@ def worded(error: BaseException, layout: Layout | None) -> str:
     missing = re.search(r"Could not (?:override|append to) '?([\w.]+)", str(error))
     if missing is not None and layout is not None:
         return explained(missing[1], layout)
+    several = re.search(r"Ambiguous value for argument '(([^=]+)=([^']*))'", str(error))
+    if several is not None:
+        word, key, values = several.groups()
+        return f"{word}: want -m {word} for a run of each value, or '{key}=[{values}]' for a list"
     word = getattr(error, "override", None)
     if word is not None:  # Hydra's grammar could not read it
         return f"{word}: cannot be read ({first_line(error)}); check its brackets and quotes"
@@ -261,6 +283,8 @@ def explained(key: str, layout: Layout) -> str:
     # The name may be right and the place wrong.
     elsewhere = [other for other in layout.keys if other.endswith(f".{last}")]
     meant = _close(last, beside if parent else layout.top, 0.8 if elsewhere else 0.6)
+    if key in OTHER_NAMES:
+        return f"{key}: unknown key; want {OTHER_NAMES[key]}"
     near = [*(f"{parent}.{one}" if parent else one for one in meant), *elsewhere][:3]
     return f"{key}: unknown key" + (f"; did you mean {' or '.join(near)}?" if near else "")
 

@@ -174,6 +174,7 @@ def test_no_comparable_run_is_refused_with_the_reasons(database, tmp_path):
         ("results.json", "[]", r"its results\.json holds no results of a run"),
         ("detections.json", "", r"lts seed 0 \(\w{8}\) of gap: \S+detections\.json: not readable as JSON"),
         ("detections.json", '{"images": 8}', r"detections\.json: want the images, truth and detections of a run"),
+        ("detections.json", '{"images": 1, "truth": []}', r"detections\.json: holds no detections of the learned"),
         ("detections.json", '{"images": 0, "truth": []}', r"detections\.json: want the images, truth and"),
     ],
 )  # fmt: skip

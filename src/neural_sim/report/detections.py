@@ -78,6 +78,8 @@ def read_detections(file: Path) -> tuple[LabelledImages, dict[str, list[Detectio
         count = stored.pop("images")
         by_image = {which: _by_image(rows, count) for which, rows in stored.items()}
         truth = by_image.pop("truth")
+        if not truth:
+            raise ValueError("no images")
         return without_pixels([(image["boxes"], image["labels"]) for image in truth]), by_image
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{file}: want the images, truth and detections of a run ({error!r})") from error

@@ -268,6 +268,8 @@ def _outcomes(run: FinishedRun, results: Mapping[str, Any], file: Path) -> dict[
     names = list(results["psi"])
     try:
         truth, detections = read_detections(file)
+        if "learned" not in detections:
+            raise ValueError(f"{file}: holds no detections of the learned distribution's detector")
     except ValueError as error:
         raise ValueError(
             f"{run.label} of {run.experiment}: {error}; restore the file or delete the run"

@@ -18,7 +18,7 @@ from neural_sim.field.grid import GridField
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.outer.progress import duration
-from neural_sim.stages.cameras import MasksStage
+from neural_sim.stages.cameras import CommandMasksStage, MasksStage
 from neural_sim.stages.detector import DetectorStage, TrainedStage
 from neural_sim.stages.field import FieldStage
 from neural_sim.stages.psi import PsiStage
@@ -32,8 +32,6 @@ from neural_sim.tasks.context import Context
 
 MEASURED: dict[str, tuple[float, float]] = {
     "views": (0.8, 0.85),
-    "photographs": (1.0, 1.0),
-    "masks": (5.0, 100.0),
     "field": (1.4, 13.8),
     "target_sets": (0.5, 1.5),
     "detector": (1.5, 0.5),
@@ -46,7 +44,7 @@ MEASURED: dict[str, tuple[float, float]] = {
 }
 """CPU seconds of one thread for each kind of work, and for each million of its pixels or rays.
 
-From +experiment=pose_gap at scale=smoke and scale=quick, and +experiment=photographs at scale=quick.
+From +experiment=pose_gap at scale=smoke (commit 0e8c613) and scale=quick (commit bf70253).
 """
 LAYERS = 0.1
 """CPU seconds of one thread for ``_layers``, on the same machine."""
@@ -111,12 +109,13 @@ def _by_costs(context: Context, missing: Sequence[Stage[Any]]) -> str:
 
 def _with_scored(context: Context, missing: Sequence[Stage[Any]]) -> list[Stage[Any]]:
     """Add what is scored at the end and is not known by its key yet: psi is not learned."""
-    graph = context.graph
-    found = list(missing)
+    graph, found = context.graph, list(missing)
+    known = {stage.entry for stage in missing}
     if {"evaluate", "report"} & set(context.stages):
         if graph.target_psi is not None:
-            found += context.results.missing([graph.scores(graph.target_psi, "matched")])
-        if graph.learned in missing and not isinstance(graph.learned.method, Fixed):
+            matched = context.results.missing([graph.scores(graph.target_psi, "matched")])
+            found += [stage for stage in matched if stage.entry not in known]
+        if graph.learned.entry in known and not isinstance(graph.learned.method, Fixed):
             found.append(graph.trained_on(graph.psi("initial"), "learned"))
     return found
 
@@ -134,14 +133,12 @@ def _work(stage: Stage[Any]) -> list[tuple[str, float]] | None:
     if isinstance(stage, ViewsStage):
         views = stage.settings
         number = views.count + views.held_out
-        kind = "views" if stage.objects.part(stage.object).has_meshes else "photographs"
-        return [(kind, number * views.image_size**2)]
+        known = stage.objects.part(stage.object).has_meshes
+        return [("views", number * views.image_size**2)] if known else None
     if isinstance(stage, FieldStage):
         rays = getattr(stage.recipe.fitting, "keywords", {}).get("batch_rays")
         known = stage.recipe.kind is GridField and stage.views.settings.lights is None and rays
         return [("field", stage.recipe.steps * rays)] if known else None
-    if isinstance(stage, MasksStage):
-        return [("masks", stage.scene.steps * stage.scene.batch_rays)]
     if isinstance(stage, TargetSetsStage):
         return _of_target(stage)
     if isinstance(stage, DetectorStage):
@@ -151,7 +148,7 @@ def _work(stage: Stage[Any]) -> list[tuple[str, float]] | None:
         return [("symmetry", 0.0)]
     if isinstance(stage, PsiStage):
         return _of_psi(stage)
-    return None if isinstance(stage, (TrainedStage, ShownStage)) else []
+    return None if isinstance(stage, (TrainedStage, ShownStage, MasksStage, CommandMasksStage)) else []
 
 
 def _of_target(stage: TargetSetsStage) -> list[tuple[str, float]] | None:
@@ -177,12 +174,7 @@ def _of_psi(stage: PsiStage) -> list[tuple[str, float]] | None:
     rendered = stage.pool.per_bin * bins * len(warm.names) * _pixels(warm)
     iterations = 1 if outer.patience is not None else outer.iterations
     reads = [("reading", rendered)] if isinstance(outer.first_step, LabelShift) else []
-    return [
-        ("pool", rendered),
-        *reads,
-        *(iterations - (not reads)) * _iteration(stage),
-        ("training", _trained(stage)),
-    ]
+    return [("pool", rendered), *reads, *(iterations - 1) * _iteration(stage), ("training", _trained(stage))]
 
 
 def _more(stage: Stage[Any]) -> float:
