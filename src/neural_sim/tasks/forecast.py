@@ -136,8 +136,8 @@ def _work(stage: Stage[Any]) -> list[tuple[str, float]] | None:
         known = stage.objects.part(stage.object).has_meshes
         return [("views", number * views.image_size**2)] if known else None
     if isinstance(stage, FieldStage):
-        rays = getattr(stage.recipe.fitting, "keywords", {}).get("batch_rays")
-        known = stage.recipe.kind is GridField and stage.views.settings.lights is None and rays
+        rays = getattr(stage.recipe.fitting, "keywords", {}).get("batch_rays", 0)
+        known = stage.recipe.kind is GridField and stage.views.settings.lights is None and rays > 0
         return [("field", stage.recipe.steps * rays)] if known else None
     if isinstance(stage, TargetSetsStage):
         return _of_target(stage)

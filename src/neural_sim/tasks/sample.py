@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from PIL import Image
 from torch import Tensor
@@ -62,7 +62,7 @@ class SampleTask(Task):
         for stage in context.shown(graph.views, "views"):
             self._write_capture(made / "captures" / stage.object, stage, context.results(stage))
         (made / "meshes").mkdir()
-        for name, item in graph.objects.items.items():
+        for name, item in cast(Meshes, graph.objects).items.items():  # as ``reads`` has made sure
             item.mesh.copy().apply_transform(item.transform).export(made / "meshes" / f"{name}.glb")
         self._write_labels(made, targets.val, graph.names, opencv_entry(graph.camera))
         (made / "new").mkdir()
