@@ -308,6 +308,7 @@ def test_what_was_read_in_part_is_not_read():
     zoom = replace(SHOWN[0], factor="zoom", finding="uncertain")
     assert read_objects(SHOWN) == {"a"} and read_objects((*SHOWN, zoom)) == set()
     assert read_objects((replace(SHOWN[0], finding="stays"),)) == {"a"}
+    assert read_objects((replace(SHOWN[0], finding="nearer"),)) == set()
 
 
 def test_one_iteration_takes_the_first_step_alone(scene, monkeypatch):

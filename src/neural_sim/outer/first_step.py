@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.baseline.label_shift.estimate import Groups, estimate
-from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.baseline.label_shift.evidence import MOVING, FactorEstimate
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.outer.steps import Proposal
 from neural_sim.ranges import validated
@@ -81,11 +81,11 @@ def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:
 
     If several factors move, the most significant one counts, with its p-value times their number (Bonferroni).
     """
-    moving = [one.p_value for one in factors if one.name == name and one.finding == "moves"]
+    moving = [one.p_value for one in factors if one.name == name and one.finding in MOVING]
     return min(1.0, len(moving) * min(moving)) if moving else 1.0
 
 
 def read_objects(factors: Sequence[FactorEstimate]) -> set[str]:
-    """Return the names of the objects with a usable estimate of every factor, whether or not psi moves there."""
+    """Return the names of the objects with a final estimate of every factor, whether or not psi moves there."""
     unread = {one.name for one in factors if one.finding not in ("moves", "stays")}
     return {one.name for one in factors} - unread

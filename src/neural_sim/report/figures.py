@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
-from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.baseline.label_shift.evidence import MOVING, FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.parameter.distributions import merged
@@ -118,7 +118,7 @@ def shown_panel(axes: Any, one: FactorEstimate) -> None:
     axes.bar(at - 0.2, start, 0.38, color=MUTED, alpha=0.6, label="psi")
     if one.finding != "too few boxes":
         errors = np.stack([p - low, high - p]).clip(0.0)
-        strong = 1.0 if one.finding == "moves" else 0.4
+        strong = 1.0 if one.finding in MOVING else 0.4
         axes.bar(at + 0.2, p, 0.38, yerr=errors, color=METHOD_COLOURS["learned"], ecolor=INK, capsize=2,
                  label="target", alpha=strong)  # fmt: skip
     style(axes)

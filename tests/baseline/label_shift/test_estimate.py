@@ -167,16 +167,18 @@ def test_renders_that_are_not_told_apart_move_nothing(posed):
     assert "its pose cannot be told from renders" in same.factors[0].sentence
 
 
-def test_an_estimate_that_may_be_far_off_moves_nothing(posed, found):
+def test_an_estimate_that_may_be_far_off_moves_psi_only_if_psi_is_farther_off(posed, found):
     """Intervals are those of the posterior: what is expected between it and the estimate is no more than they hold."""
     scene, target, psi = posed
     lamp = found.factors[0]
     assert 0.0 < lamp.doubt < 0.5 * sum(high - low for low, high in zip(lamp.low, lamp.high, strict=True))
-    doubtful = estimate(
-        scene, target, psi, replace(SETTINGS, doubt=0.5 * lamp.doubt), torch.Generator().manual_seed(0)
-    )
-    assert [one.finding for one in doubtful.factors] == ["uncertain", "stays"]
-    torch.testing.assert_close(doubtful.psi, psi.double())
+    ratio = lamp.doubt / lamp.apart
+    assert 0.0 < ratio < 1.0
+    for nearer, finding in ((0.9 * ratio, "uncertain"), (1.1 * ratio, "nearer")):
+        settings = replace(SETTINGS, doubt=0.5 * lamp.doubt, nearer=nearer)
+        doubtful = estimate(scene, target, psi, settings, torch.Generator().manual_seed(0))
+        assert [one.finding for one in doubtful.factors] == [finding, "stays"]
+        torch.testing.assert_close(doubtful.psi, found.psi if finding == "nearer" else psi.double())
 
 
 def test_a_search_that_does_not_end_moves_nothing(posed, monkeypatch):

@@ -27,10 +27,11 @@ def test_an_estimate_comes_back_from_json():
     assert estimates_of(stored) == (MOVES,)
 
 
-def test_doubt_is_the_mean_total_variation_of_the_draws():
+def test_doubts_are_the_mean_total_variations_of_the_draws():
     p = torch.tensor([0.5, 0.5]).double()
     drawn = torch.tensor([[0.5, 0.5], [0.8, 0.2], [0.1, 0.9]]).double()
-    assert Span.of(p, drawn, 0.9).doubt == pytest.approx((0.0 + 0.3 + 0.4) / 3)
+    span = Span.of(p, drawn, torch.tensor([0.0, 1.0]).double(), 0.9)
+    assert (span.doubt, span.apart) == pytest.approx(((0.0 + 0.3 + 0.4) / 3, (0.5 + 0.8 + 0.1) / 3))
 
 
 def test_a_sentence_names_groups_with_the_interval_of_their_sum():
@@ -49,6 +50,14 @@ def test_a_sentence_names_groups_with_the_interval_of_their_sum():
 )
 def test_a_sentence_says_why_psi_does_not_move(finding, said):
     assert said in dataclasses.replace(MOVES, finding=finding, doubt=0.4).sentence
+
+
+def test_an_estimate_that_is_only_nearer_says_how_far_off_both_may_be():
+    nearer = dataclasses.replace(MOVES, finding="nearer", doubt=0.4, apart=0.86)
+    assert nearer.sentence == (
+        "your target shows the mug in pose bins 1/3 (0.80 to 1.00); the estimate may be off by 0.40 in total "
+        "variation, but psi is off by 0.86"
+    )
 
 
 def test_a_search_that_did_not_end_is_said():

@@ -12,25 +12,43 @@ from torch import Tensor
 
 from neural_sim.parameter.distributions import total_variation
 
-Finding = Literal["moves", "stays", "uncertain", "not told apart", "fits no render", "too few boxes"]
+Finding = Literal[
+    "moves", "nearer", "stays", "uncertain", "not told apart", "fits no render", "too few boxes"
+]
+MOVING: frozenset[Finding] = frozenset({"moves", "nearer"})
+"""Findings with which psi moves to the estimate."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Probabilities ``p`` with intervals, and the expected total variation between ``p`` and the target (``doubt``)."""
+    """Probabilities ``p`` with intervals, and expected total variations from the target's distribution.
+
+    Attributes:
+        p: the probabilities.
+        low: lower ends of their intervals.
+        high: upper ends of their intervals.
+        doubt: expected total variation between ``p`` and the target.
+        apart: the same between the present psi and the target.
+    """
 
     p: tuple[float, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
     doubt: float
+    apart: float
 
     @staticmethod
-    def of(p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], covered: float) -> Span:
-        """Take intervals that cover the central fraction ``covered`` of random draws of what p estimates."""
+    def of(
+        p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], now: Float[Tensor, "k"], covered: float
+    ) -> Span:
+        """Take intervals that cover the central fraction ``covered`` of random draws of what p estimates.
+
+        ``now`` are the probabilities at the present psi.
+        """
         tail = 0.5 * (1.0 - covered)
         low, high = (tuple(drawn.quantile(part, 0).tolist()) for part in (tail, 1.0 - tail))
-        doubt = total_variation(drawn, p.expand_as(drawn)).mean()
-        return Span(tuple(p.tolist()), low, high, float(doubt))
+        doubt, apart = (float(total_variation(drawn, q.to(drawn).expand_as(drawn)).mean()) for q in (p, now))
+        return Span(tuple(p.tolist()), low, high, doubt, apart)
 
 
 @dataclass(frozen=True)
@@ -51,11 +69,13 @@ class FactorEstimate:
             renders.
         accuracy: fraction of held-out renders whose group of bins is recognised; for lights, the fraction of the
             guesses' variance that weights explain.
-        finding: whether psi moves. It ``moves`` to the estimate, or ``stays`` because the target may be at the present
-            psi. Otherwise it does not move because the estimate is ``uncertain``, renders are ``not told apart``, the
-            target ``fits no render``, or there are ``too few boxes``.
+        finding: whether psi moves. It ``moves`` to the estimate; or it moves there although the boxes leave much open,
+            because the estimate is certainly ``nearer`` to the target than the present psi is; or it ``stays`` because
+            the target may be at the present psi. Otherwise it does not move because the estimate is ``uncertain``,
+            renders are ``not told apart``, the target ``fits no render``, or there are ``too few boxes``.
         chance: accuracy of guessing without looking.
         doubt: expected total variation between the estimate and the target's distribution.
+        apart: the same between the present psi and the target's distribution.
         converged: whether the search for the mixture converged, which it does not if the likelihood is flat.
     """
 
@@ -73,6 +93,7 @@ class FactorEstimate:
     finding: Finding
     chance: float = 0.0
     doubt: float = 0.0
+    apart: float = 0.0
     converged: bool = True
 
     @property
@@ -99,11 +120,14 @@ class FactorEstimate:
             f"{_called(group)} ({_sum(self.low, group):.2f} to {_sum(self.high, group):.2f})"
             for group in self._largest
         )
-        ending = (
-            f"; psi stays, because it may be right already (p = {self.p_value:.2g})"
-            if self.finding == "stays"
-            else ""
-        )
+        ending = ""
+        if self.finding == "stays":
+            ending = f"; psi stays, because it may be right already (p = {self.p_value:.2g})"
+        if self.finding == "nearer":
+            ending = (
+                f"; the estimate may be off by {self.doubt:.2f} in total variation, but psi is off by "
+                f"{self.apart:.2f}"
+            )
         return f"your target shows the {self.name} in {self.factor} {shown}{ending}"
 
     @property

@@ -11,7 +11,14 @@ from torch import Tensor
 
 from neural_sim.baseline.label_shift.calibration import BoxReader, calibrate
 from neural_sim.baseline.label_shift.crops import SIZE, Crops, quarters
-from neural_sim.baseline.label_shift.evidence import FactorEstimate, Finding, Span, Strangeness, part_farther
+from neural_sim.baseline.label_shift.evidence import (
+    MOVING,
+    FactorEstimate,
+    Finding,
+    Span,
+    Strangeness,
+    part_farther,
+)
 from neural_sim.baseline.label_shift.mixture import Cells, Status, grouped, maximise, posterior, ratio_test
 from neural_sim.baseline.label_shift.moments import Response, distance, fitted, matched, scattered
 from neural_sim.baseline.label_shift.network import BinNetwork, Known, Outputs, outputs_of
@@ -71,7 +78,7 @@ class Reader:
         object_ = _Object(self, name, now, groups, held, known, seen, limits)
         found, new = object_.found(), dict(object_.psi)
         for one in found:
-            if one.finding == "moves":
+            if one.finding in MOVING:
                 factor = self.distribution.factor(one.factor)
                 new[one.factor] = factor.project(
                     factor.psi_of(torch.tensor(one.p, dtype=torch.float64), factor.closed(name))
@@ -155,7 +162,7 @@ class _Object:
         settings, boxes = self.reader.settings, len(self.seen)
         finding: Finding = "moves" if read.p_value <= settings.level else "stays"
         if finding == "moves" and read.span.doubt > settings.doubt:
-            finding = "uncertain"
+            finding = "nearer" if read.span.doubt <= settings.nearer * read.span.apart else "uncertain"
         if not read.converged or read.accuracy - read.chance < settings.skill * (1.0 - read.chance):
             finding = "not told apart"
         if strange > (settings.strange if self.reader.distribution.binned else BEYOND_ALL):
@@ -167,7 +174,7 @@ class _Object:
         span = read.span
         return FactorEstimate(
             self.name, factor.name, boxes, start, span.p, span.low, span.high, own, read.p_value, strange,
-            read.accuracy, finding, read.chance, span.doubt, read.converged,
+            read.accuracy, finding, read.chance, span.doubt, span.apart, read.converged,
         )  # fmt: skip
 
     def _binned(self) -> tuple[dict[str, _Read], Float[Tensor, "held"]]:
@@ -202,7 +209,7 @@ class _Object:
                 p_value = ratio_test(
                     seen, cells, null, (held, truth), settings.prior, settings.draws, generator
                 )
-            span = Span.of(best.p[i] @ within[i].T, drawn[i] @ within[i].T, settings.interval)
+            span = Span.of(best.p[i] @ within[i].T, drawn[i] @ within[i].T, p_now[i], settings.interval)
             accuracy = float((told[i] == true[i]).double().mean())
             lengths = [len(group) for group in groups[i]]
             chance = max(lengths) / sum(lengths)
@@ -228,7 +235,7 @@ class _Object:
         now, boxes = self.psi[factor.name].double(), len(self.seen)
         each = [[b] for b in range(1, factor.lights + 1)]
         if not boxes:
-            return _Read(Span.of(now, now[None], settings.interval), each, 1.0, response.explained, 0.0)
+            return _Read(Span.of(now, now[None], now, settings.interval), each, 1.0, response.explained, 0.0)
         mean, covariance = self.seen.weights.mean(0), response.covariance(boxes, now)
 
         def weights(means: Tensor) -> Tensor:
@@ -242,7 +249,7 @@ class _Object:
         p_value = (1 + int((statistic(under) >= statistic(mean)).sum())) / (settings.draws + 1)
         best = weights(mean)
         drawn = weights(scattered(mean, response.covariance(boxes, best), settings.draws, generator))
-        span = Span.of(best, drawn, settings.interval)
+        span = Span.of(best, drawn, now, settings.interval)
         return _Read(span, each, p_value, response.explained, 0.0)
 
 

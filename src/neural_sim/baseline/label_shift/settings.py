@@ -31,8 +31,10 @@ class LabelShift:
         interval: coverage probability of the intervals.
         strange: largest probability that a box looks less like the renders than a held-out render does; above it, the
             object's psi does not move. If psi has lights only, the limit is ``reading.BEYOND_ALL`` instead.
-        doubt: largest expected total variation between an estimate and the target's distribution; above it, psi does
-            not move.
+        doubt: largest expected total variation between an estimate and the target's distribution with which the
+            estimate is final. Above it, psi moves only if ``nearer`` allows that.
+        nearer: largest ratio of that total variation to the same of the present psi with which psi moves to an estimate
+            that is not final: in the psi loop, the object still takes steps along derivatives afterwards.
         skill: smallest accuracy on held-out renders, on a scale from 0 (chance) to 1; below it, psi does not move.
         fewest: smallest number of an object's boxes with which its psi may move.
         name: name in reports.
@@ -50,6 +52,7 @@ class LabelShift:
     interval: Annotated[float, Gt(0), Lt(1)] = 0.9
     strange: PositiveFraction = 0.7
     doubt: Fraction = 0.35
+    nearer: Fraction = 0.5
     skill: Fraction = 0.15
     fewest: PositiveInt = 8
     name: str = "label_shift"
