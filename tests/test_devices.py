@@ -11,7 +11,7 @@ MB = 2**20
 
 def test_a_gpu_that_is_not_there_is_refused_with_the_key(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)  # nor is one that is there, for this test
-    with pytest.raises(ValueError, match="trainer=gpu: no cuda device"):
+    with pytest.raises(ValueError, match="trainer=gpu: torch finds no cuda device"):
         devices.device_of("gpu")
     with pytest.raises(ValueError, match=r"trainer\.accelerator"):
         devices.device_of("tpu")

@@ -77,7 +77,7 @@ REFUSED = {
     ),
     "not judged": (
         lambda a, b: a == "baseline=neural_sim" and b == "outer/steps=free",
-        "outer/first_step: a training accepts or rejects",
+        "outer/first_step: a training must accept or reject the proposal",
     ),
     "untrained": (
         lambda a, b: "train_first=false" in a and b in ("outer/steps=trust_region", "outer/adjoint=unrolled"),
