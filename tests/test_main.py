@@ -1,6 +1,7 @@
 """The command line as a user meets it: one whole run, and what is refused before any stage."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -22,16 +23,34 @@ def _config(*overrides, hydra=False):
     return composed(*overrides, hydra=hydra)
 
 
-def _run(folder, *arguments):
+CAPTURES_ONLY = (
+    "pycolmap",
+    "neural_sim.field.scene",
+    "neural_sim.objects.motion",
+    "neural_sim.renderer.pose_refinement",
+)
+
+
+def _run(folder, *arguments, **environment):
     paths = [f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db", f"hydra.run.dir={folder}/run"]
     command = [sys.executable, "-m", "src.main", *arguments, *paths]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=600, env=os.environ | environment
+    )
 
 
 def test_one_run_from_objects_to_a_report(tmp_path, empty_store):
     shutil.copy(empty_store, tmp_path / "mlflow.db")
-    done = _run(tmp_path, "+experiment=pose_gap", "scale=smoke", "progress=false")
+    done = _run(
+        tmp_path, "+experiment=pose_gap", "scale=smoke", "progress=false", PYTHONPROFILEIMPORTTIME="1"
+    )
     assert done.returncode == 0, done.stderr[-3000:]
+    loaded = [
+        line.split("|")[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time:")
+    ]
+    assert "neural_sim.stages.field" in loaded and not [
+        name for name in loaded if name.startswith(CAPTURES_ONLY)
+    ], "a run on meshes loads what only captures need"
     assert "its scores mean nothing" in done.stdout
     command, address, compare, _, sentence, page = done.stdout.splitlines()[-6:]
     assert "on synthetic test images" in sentence or "over synthetic test images" in sentence
