@@ -178,6 +178,26 @@ def test_a_blurred_surface_is_found(capture):
         assert np.abs(ours - np.array(theirs)).max() < 4.0 * CELL
 
 
+def test_a_bulge_of_the_table_between_the_arms_of_an_object_is_not_the_objects(capture):
+    """An L from above; in its corner, which its hull includes, the table bulges by four cells and is less dense."""
+    arms = [((-0.25, -0.2, -0.3), (0.0, 0.3, 0.35)), ((-0.25, -0.2, -0.3), (0.5, 0.0, 0.35))]
+    bulge = (CELL, CELL, -0.3), (4.0 * CELL, 3.0 * CELL, -0.3 + 3.8 * CELL)
+    grid = painted(lambda points: scene(points, others=arms) & ~box_of(points, (0.02, 0.02, -0.28), HIGH))
+    axis = torch.linspace(-2.0, 2.0, RESOLUTION + 1)
+    points = expand(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3))
+    grid.table[box_of(points, *bulge), 0] = 0.1  # softplus(0.2) = 0.80 an edge, of which 55 % is absorbed
+    grid.mark()
+    first = found(grid, capture)
+    generator = torch.Generator().manual_seed(0)
+    again = find(grid, pixels_of(capture), WHOLE, capture, UP, None, generator, first)
+    centres = expand(cell_centres(RESOLUTION))
+    soft = box_of(centres, (CELL, CELL, -0.3 + 1.5 * CELL), bulge[1])  # above the cells that touch the table
+    hard = box_of(centres, *arms[0]) | box_of(centres, *arms[1])
+    assert first.region.cells[soft].float().mean() > 0.7 and not bool(again.region.cells[soft].any())
+    assert torch.equal(again.region.cells[hard], first.region.cells[hard])
+    assert float(again.region.cells[hard].float().mean()) > 0.9
+
+
 def test_fog_before_an_object_does_not_hide_it(standing, capture):
     """A slab in the air that takes up to three quarters of the light hides nothing: the masks are as without it."""
     object_ = found(standing, capture)

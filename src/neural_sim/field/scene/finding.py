@@ -12,7 +12,14 @@ from torch import Tensor
 from neural_sim.field.scene.fitting import ScenePixels
 from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.plane import Plane, refitted, supporting_plane
-from neural_sim.field.scene.region import GROUND, Region, cell_centres, connected_region, without_fog
+from neural_sim.field.scene.region import (
+    GROUND,
+    Region,
+    cell_centres,
+    connected_region,
+    without_bulges,
+    without_fog,
+)
 from neural_sim.field.scene.space import Frame, expand
 from neural_sim.field.scene.surface import seen_surface
 from neural_sim.objects.capture import Capture
@@ -32,7 +39,8 @@ THICK = 0.75
 class Found:
     """The object's region in the normalised frame, and its place in the capture's.
 
-    ``centre``, ``radius`` and ``box`` are in the capture's frame. ``occupied`` marks the field's cells without fog.
+    ``centre``, ``radius`` and ``box`` are in the capture's frame. ``occupied`` marks the field's cells without fog and
+    without bulges of the plane.
     """
 
     frame: Frame
@@ -92,12 +100,16 @@ def find(
                 f"{capture.source}: objects.masks=scene does not find {capture.name} near ({middle}), where the "
                 "cameras look; set objects.box to two corners around it, or give masks"
             )
+    whole = region.cells
+    if before is not None:
+        region = without_bulges(grid, surface, region)
     low, high = (frame.out(corner) for corner in region.corners())
     centre = 0.5 * (low + high)
     cells = frame.out(expand(cell_centres(grid.resolution)[region.cells]).double().numpy())
     radius = float(np.linalg.norm(cells - centre, axis=1).max())
     corners = (low, high) if box is None else (np.array(box[0]), np.array(box[1]))
-    return Found(frame, region, centre, radius, corners, without_fog(grid, surface, region))
+    occupied = without_fog(grid, surface, region) & (region.cells | ~whole)
+    return Found(frame, region, centre, radius, corners, occupied)
 
 
 def _boxed(

@@ -90,12 +90,15 @@ class SceneGrid:
         return (square + 1e-6).sqrt().mean()
 
     @torch.no_grad()
-    def mark(self) -> None:
-        """Update the occupied cells: those with a vertex that absorbs more than ``EMPTY``."""
+    def absorbed(self) -> Float[Tensor, "cells"]:
+        """Compute the largest fraction absorbed over a cell's edge at any of each cell's vertices."""
         absorbed = -torch.expm1(-functional.softplus(GAIN * self.table[:, 0]))
         side = self.resolution + 1
-        largest = functional.max_pool3d(absorbed.view(1, 1, side, side, side), 2, 1)
-        self.occupied = largest.flatten() > EMPTY
+        return functional.max_pool3d(absorbed.view(1, 1, side, side, side), 2, 1).flatten()
+
+    def mark(self) -> None:
+        """Update the occupied cells: those with a vertex that absorbs more than ``EMPTY``."""
+        self.occupied = self.absorbed() > EMPTY
 
     @torch.no_grad()
     def moved(self, old: Frame, new: Frame) -> SceneGrid:

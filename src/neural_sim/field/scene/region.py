@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -38,6 +39,10 @@ APART = 1.0
 """Height in cells above the plane from which cells connect; lower, the plane's roughness would connect them."""
 GROUND = 1.0
 """Height in cells above the plane from which samples belong to the object."""
+BULGE = 4.0
+"""Height in cells up to which the surface of a plane without texture bulges towards the cameras."""
+SOFT = 0.6
+"""Largest density of a bulge, relative to the object's median density above all bulges."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +56,13 @@ class Region:
 
     def holds(self, contracted: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Tell whether contracted positions lie in the object."""
-        inside = self.cells[cells_of(contracted, self.resolution)]
-        if self.plane is not None:
-            inside &= self.plane.height(expand(contracted)) > self.ground
-        return inside
+        return self.cells[cells_of(contracted, self.resolution)] & ~self.carries(contracted)
+
+    def carries(self, contracted: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Tell whether contracted positions lie in or under the rough surface of the plane."""
+        if self.plane is None:
+            return torch.zeros(len(contracted), dtype=torch.bool)
+        return self.plane.height(expand(contracted)) <= self.ground
 
     def cells_in(self, own: Frame, frame: Frame, resolution: int) -> Bool[Tensor, "cells"]:
         """Find the cells of another grid and frame that lie in this region's cells, at any height."""
@@ -156,6 +164,24 @@ def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[T
     sizes[0] = 0
     solid = (sizes >= SPECK)[label].view(side, side, side).float()
     return (dilate(solid).flatten() > 0) | region.cells
+
+
+def without_bulges(grid: SceneGrid, surface: SeenSurface, region: Region) -> Region:
+    """Take the bulges of the plane's surface out of a region.
+
+    Photographs from one side leave the height of a plane without texture uncertain, so that its surface bulges between
+    the feet of the object, by more than a cell, but is less dense than the object. An object that is no higher than
+    a bulge keeps its cells.
+    """
+    if region.plane is None:
+        return region
+    absorbed = grid.absorbed()
+    above = region.plane.height(expand(cell_centres(grid.resolution))) > BULGE * grid.edge
+    met = region.cells & above & (surface.hits >= HITS)
+    if not bool(met.any()):
+        return region
+    dense = absorbed > SOFT * float(absorbed[met].median())
+    return dataclasses.replace(region, cells=region.cells & (above | dense))
 
 
 def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:

@@ -31,7 +31,8 @@ def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) 
     """Compute the object's opacity in [0, 1] at each pixel, where nothing solid in front hides it.
 
     Fog counts as transparent: where few photographs look, a field explains them by something thin in the air, which
-    would otherwise hide the object.
+    would otherwise hide the object. So does the plane: cameras are above it, so that it hides nothing that stands on
+    it, but its rough surface would hide the object's foot.
     """
     height, width = rays.seen.shape
     directions = rays.directions.reshape(-1, 3).float()
@@ -45,7 +46,9 @@ def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) 
             seen = visible(grid, bundle, torch.full((len(part),), phase), grid.samples)
             sigma = grid.density(grid.raw(seen.corners, seen.weights)[:, 0])
             inside = region.holds(seen.positions)
-            before = transmittance(sigma.masked_fill(inside, 0.0), seen.samples)
+            before = transmittance(
+                sigma.masked_fill(inside | region.carries(seen.positions), 0.0), seen.samples
+            )
             weights = render_weights(sigma.masked_fill(~inside, 0.0), seen.samples)
             weights = weights * (FOG * before).clamp_max(1.0)
             mask[part] += sum_rays(weights[:, None], seen.samples)[:, 0] / len(PHASES)
