@@ -1,4 +1,4 @@
-"""Where a run computes: the one place that chooses a torch device, and the trainers that run on it.
+"""Choose the torch device of a run, which only this module does, and build the trainers that run on it.
 
 Draws and psi, few numbers each, are made on the CPU by CPU generators, so that a seed draws the same scenes on every
 device. Fields, images, features and targets live on the run's device; results are copied to the CPU to be stored.

@@ -1,4 +1,4 @@
-"""From rays to pixels through any field: sample, query, composite; with derivatives, and for whole views."""
+"""Render rays and whole views of any field (sample, query, composite), with derivatives."""
 
 from __future__ import annotations
 

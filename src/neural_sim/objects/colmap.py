@@ -26,8 +26,8 @@ from neural_sim.pictures import by, read_header
 _log = logging.getLogger(__name__)
 
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", ".")
-"""Where models are looked for, in this order. COLMAP numbers several models (``sparse/0``, ``sparse/1``); the one with
-the most photographs is used."""
+"""Folders that are searched for models, in this order. COLMAP numbers several models (``sparse/0``, ``sparse/1``); the
+one with the most photographs is used."""
 PLACES = ("images", "input")
 """Folders of photographs (``input`` in 3D Gaussian splatting tools); without either, the capture's own folder."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -28,7 +28,7 @@ _ACTIONS: Mapping[OnUntrusted, Action] = {
 
 
 Actions = dict[str, dict[str, Action]]
-"""What happens to each step, by object and factor. A trusted step ``waited`` if a trust region does not take it yet."""
+"""The action on each step, by object and factor. A trusted step ``waited`` if the trust region does not take it yet."""
 
 
 @validated
@@ -145,12 +145,12 @@ class Certificate:
 
     @property
     def stopped(self) -> bool:
-        """Whether the loop ends here."""
+        """Return whether the loop ends after this iteration."""
         return "stopped" in self._taken
 
     @property
     def void(self) -> bool:
-        """Whether this iteration's derivative is discarded, so that it does not enter the momentum either."""
+        """Return whether this iteration's derivative is discarded; it then does not enter the momentum either."""
         return self.stopped or (bool(self.doubts) and not self._taken & {"shrunk", "kept"})
 
     def waiting(self, steps: Collection[tuple[str, str]]) -> Certificate:

@@ -1,4 +1,4 @@
-"""What derivatives take from the loop: losses by row, the path from psi to an image, and a recorded training."""
+"""Inputs of a derivative, from the loop: losses by row, the path from psi to an image, and a recorded training."""
 
 from __future__ import annotations
 

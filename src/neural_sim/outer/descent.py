@@ -219,7 +219,7 @@ class GradientLoop(OuterLoop, ABC):
 
     @property
     def _certifies(self) -> bool:
-        """Whether this iteration compares its derivative with the response of training."""
+        """Return whether this iteration compares its derivative with the response of training."""
         every = self.settings.certify_every
         return every > 0 and (len(self.records) + 1) % every == 0
 

@@ -53,7 +53,7 @@ class Span:
 
 @dataclass(frozen=True)
 class FactorEstimate:
-    """What the target's boxes show of one factor of an object's psi.
+    """Estimate of one factor of an object's psi from the target's boxes, with the evidence for it.
 
     Attributes:
         name: the object.
@@ -98,7 +98,7 @@ class FactorEstimate:
 
     @property
     def sentence(self) -> str:
-        """What the target shows, as a sentence for the console and the pages."""
+        """Return the finding as a sentence for the console and the pages."""
         if self.finding == "too few boxes":
             return f"{self.name}: {self.boxes} boxes are too few to estimate its {self.factor}"
         if self.finding == "fits no render":

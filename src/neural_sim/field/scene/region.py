@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.ndimage
@@ -181,7 +180,7 @@ def without_bulges(grid: SceneGrid, surface: SeenSurface, region: Region) -> Reg
     if not bool(met.any()):
         return region
     dense = absorbed > SOFT * float(absorbed[met].median())
-    return dataclasses.replace(region, cells=region.cells & (above | dense))
+    return replace(region, cells=region.cells & (above | dense))
 
 
 def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:
