@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from neural_sim.documents import finite, markdown_table, read_json, write_json
+from neural_sim.documents import finite, markdown_table, plain_table, read_json, write_json
 
 
 def test_numbers_that_are_not_finite_become_null_at_every_depth(tmp_path):
@@ -53,3 +53,26 @@ def test_a_table_has_its_head_its_rule_and_escaped_cells():
     )
     with pytest.raises(ValueError, match=r"want 2 cells .* got \[1\]"):
         markdown_table(["a", "b"], [[1]])
+
+
+def test_a_plain_table_wraps_long_titles_and_aligns_numbers_right():
+    text = plain_table(
+        ["", "before", "if the target were known"], [["a", "1.0", "22.5"], ["longer", "nan", "3.0"]]
+    )
+    assert text.splitlines() == [
+        "                     if the",
+        "                target were",
+        "        before        known",
+        "a          1.0         22.5",
+        "longer     nan          3.0",
+    ]
+    pitcher = ["004_a_long_object_name", "12.3", "45.6", "45.6", "0.84 -> 0.08", "0.92 -> 0.10"]
+    head = [
+        "",
+        "before",
+        "after",
+        "if the target were known",
+        "pose, distance to target",
+        "zoom, distance to target",
+    ]
+    assert max(map(len, plain_table(head, [pitcher]).splitlines())) <= 80, "a terminal has 80 columns"

@@ -1,10 +1,11 @@
-"""Write files completely or not at all, read and write standard JSON, and make Markdown tables and sections."""
+"""Write files completely or not at all, read and write standard JSON, and make tables and Markdown sections."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,22 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
 
 def _line(cells: Sequence[object]) -> str:
     return "| " + " | ".join(str(cell).replace("|", r"\|") for cell in cells) + " |"
+
+
+def plain_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in plain text, the first column left-aligned; long titles are wrapped over their columns."""
+    widths = [max(len(row[number]) for row in rows) for number in range(len(head))]
+    titles = [textwrap.wrap(title, max(11, width)) for title, width in zip(head, widths, strict=True)]
+    height = max(map(len, titles))
+    stacked = [[""] * (height - len(lines)) + lines for lines in titles]
+    lines = [*zip(*stacked, strict=True), *rows]
+    first, *others = (max(len(line[number]) for line in lines) for number in range(len(head)))
+    text = (
+        line[0].ljust(first)
+        + "".join(f"  {cell:>{width}}" for cell, width in zip(line[1:], others, strict=True))
+        for line in lines
+    )
+    return "\n".join(map(str.rstrip, text))
 
 
 def replace_section(path: Path, name: str, markdown: str) -> None:

@@ -92,7 +92,8 @@ class TrustRegion:
     def __post_init__(self) -> None:
         if not self.smallest <= self.radius <= self.largest:
             raise UserError(
-                f"TrustRegion: want smallest <= radius <= largest, got {self.smallest}, {self.radius}, {self.largest}"
+                "outer.steps.radius: want a radius between outer.steps.smallest and outer.steps.largest, got "
+                f"{self.radius} with {self.smallest} and {self.largest}"
             )
 
     def begin(

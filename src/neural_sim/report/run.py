@@ -15,7 +15,7 @@ from torch import Tensor
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
-from neural_sim.documents import finite, markdown_table, read_json, write_json
+from neural_sim.documents import finite, markdown_table, plain_table, read_json, write_json
 from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import merged, total_variation
 from neural_sim.report.provenance import Made, caution
@@ -190,14 +190,8 @@ class RunResults:
 
     def summary(self) -> str:
         """Return the table printed at the end of a run."""
-        columns = "".join(f"{name[:12]:>13}" for name in (*self.names, "mean"))
         lines = [self.made.caution] if self.made.caution else []
-        lines.append(f"{f'{self.score} on {self.made.shows}':<28}{columns}")
-        for method, scores in self.ap.items():
-            values = [*(scores["per_class"][name] for name in self.names), mean_of(scores)]
-            lines.append(
-                f"{CALLED.get(method, method):<28}" + "".join(f"{100 * value:>13.1f}" for value in values)
-            )
+        lines += [f"{self.score} on {self.made.shows}", self._score_table()]
         if self.real:
             lines.append(
                 "trained on {photographs} photographs too (training.real.mode={mode})".format(**self.real)
@@ -205,11 +199,6 @@ class RunResults:
         if self.validation_ap is not None:
             score = f"{100 * self.validation_ap:.1f}"
             lines.append(f"{self.score} on the validation images, after: {score} (to choose settings by)")
-        for factor in self.factors if self.target_known else ():
-            lines.append(f"distance to target, {factor}")
-            for which, called in (("initial", "before"), ("learned", "after")):
-                row = "".join(f"{one.distances[which]:>13.2f}" for one in self.of_factor(factor))
-                lines.append(f"  {called:<26}{row}")
         lines += [one.sentence for one in self.shown]
         trust = untrusted(self.records)
         if trust["steps"]:
@@ -223,6 +212,20 @@ class RunResults:
         if self.left_out:
             lines.append(_left_out_line(self.left_out))
         return "\n".join(lines)
+
+    def _score_table(self) -> str:
+        """Return scores, and distances of the distributions to the target's, with a line for each object."""
+        factors = self.factors if self.target_known else ()
+        head = [CALLED.get(method, method) for method in self.ap]
+        head += [f"{factor}, distance to target" for factor in factors]
+        away = {(one.name, one.factor): one.distances for one in self.learned}
+        rows = []
+        for name in self.names:
+            row = [f"{100 * scores['per_class'][name]:.1f}" for scores in self.ap.values()]
+            row += ["{initial:.2f} -> {learned:.2f}".format(**away[name, factor]) for factor in factors]
+            rows.append([name, *row])
+        means = [f"{100 * mean_of(scores):.1f}" for scores in self.ap.values()]
+        return plain_table(["", *head], [*rows, ["mean", *means, *("" for _ in factors)]])
 
 
 def _distances(p: Mapping[str, Tensor], groups: Sequence[Sequence[int]]) -> dict[str, float]:
