@@ -233,6 +233,9 @@ def test_what_was_forgotten_is_told_by_bin_with_its_share(results, shown, tmp_pa
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]*>", "", page))
     assert "mug from bin 1: AP 100 before, 0 after (a loss of 100 to 100) on 6 test images, 50 %" in text
     assert "went from 25 to 85 %" in text and text.count("before, 0 after") == 1
+    p = results.probabilities
+    still = dataclasses.replace(results, probabilities={**p, "learned": p["initial"]})
+    assert "stayed at 25 %" in RunPage(still, lost).write({}, tmp_path).read_text()
 
 
 def test_a_curve_is_drawn_of_three_points_or_more_with_labels_that_do_not_meet(results, shown, tmp_path):
