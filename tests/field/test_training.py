@@ -1,6 +1,7 @@
 """Fitting from posed views: it learns, the same seed gives the same bits, and bad input is refused."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -126,6 +127,19 @@ def test_a_fit_that_diverges_is_refused() -> None:
         ValueError, match=r"field: the loss is nan after 8 steps: want smaller learning rates"
     ):
         fit_field(ball_views(), fitting(learning_rate=1e38), torch.Generator().manual_seed(0), steps=8)
+
+
+@pytest.mark.parametrize("photographs", [False, True])
+def test_a_fit_that_loses_all_its_cells_is_refused(photographs: bool) -> None:
+    views = ball_views()
+    known = torch.ones(views.images.shape[:3], dtype=torch.bool) if photographs else None
+    with pytest.raises(ValueError, match="no cell is occupied"):
+        fit_field(
+            replace(views, known=known),
+            fitting(learning_rate=1e38),
+            torch.Generator().manual_seed(0),
+            steps=26,
+        )
 
 
 def test_small_parts_in_the_air_are_left_out():

@@ -166,5 +166,5 @@ def _large_parts(occupied: Bool[Tensor, "nx ny nz"], seen: Bool[Tensor, "cells"]
     full = np.ones((3, 3, 3))
     scipy.ndimage.label(scipy.ndimage.binary_dilation(grid.cpu().numpy(), full, BRIDGED), full, output=parts)
     label = torch.from_numpy(parts).to(occupied.device)[occupied]
-    sizes = torch.bincount(label[seen])
+    sizes = torch.bincount(label[seen], minlength=1)
     return seen & (sizes >= LARGE * float(sizes.max()))[label.clamp_max(len(sizes) - 1)]
