@@ -24,7 +24,7 @@ CASES = [
     (MLPField, {"density_scale": 0.0}, "MLPField.density_scale: want more than 0"),
     (GRID, {"batch_rays": 0}, "GridFitting.batch_rays: want at least 1"),
     (GRID, {"prune_weight": 1.0}, "GridFitting.prune_weight: want at least 0 and less than 1"),
-    (GRID, {"resolution": 100}, "GridFitting.resolution: want a power of two from 32, got 100"),
+    (GRID, {"resolution": 100}, "GridFitting.resolution: want a power of two of at least 32, got 100"),
     (GRID, {"resolution": 64}, "GridFitting.resolution: want at least 32 after halving it 2 times, got 64"),
     (GRID, {"refine_steps": (0,)}, "GridFitting.refine_steps[0]: want at least 1"),
     (partial(AppearanceFitting, AppearanceField(), GridFitting), {"anchors": 0}, "AppearanceFitting.anchors: want"),

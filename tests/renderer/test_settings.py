@@ -33,7 +33,7 @@ CASES = [
     (PoseRefinement, {"rounds": -1}, "PoseRefinement.rounds: want at least 0"),
     (PoseRefinement, {"updates": 0}, "PoseRefinement.updates: want at least 1, got 0"),
     (PoseRefinement, {"image_size": 4}, "PoseRefinement.image_size: want at least 8"),
-    (PoseRefinement, {"resolution": 48}, "PoseRefinement.resolution: want a power of two from 32, got 48"),
+    (PoseRefinement, {"resolution": 48}, "PoseRefinement.resolution: want a power of two of at least 32, got 48"),
     (RaycastRenderer, {"supersample": 0}, "RaycastRenderer.supersample: want at least 1"),
     (choose_mesh_renderer, {"backend": "blender"}, "renderer.backend: want one of auto, pyrender, raycast"),
     (Views, {"backend": "blender"}, "Views.backend: want one of auto, pyrender, raycast, got 'blender'"),

@@ -150,7 +150,7 @@ class AppearanceField(RadianceField):
 
 
 class LitField(RadianceField):
-    """An appearance field under one code, with shared tensors; its colour also has derivatives by the code's rates."""
+    """An appearance field under one code, with shared tensors; its colour also has derivatives for the code's rates."""
 
     def __init__(
         self, field: AppearanceField, gain: Float[Tensor, "width"], gain_rates: Float[Tensor, "q width"]
@@ -211,7 +211,10 @@ class LitField(RadianceField):
         velocities: Float[Tensor, "m samples 3"],
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See the base class; here m may be 0. In closed form, so a moving light costs one small product a sample."""
+        """See the base class; here m may be 0.
+
+        The derivatives are in closed form, so that each rate of the code costs one small product per sample.
+        """
         field, grid = self.field, self.field.grid
         raw, raw_rates = grid.raw_with_tangents(positions, velocities)
         before = field.into(field.seen(raw, directions))

@@ -14,7 +14,7 @@ from neural_sim.types import PinholeCamera, Rays
 
 
 class RadianceField(nn.Module, ABC):
-    """Density and colour in the object's frame (the unit sphere around the origin)."""
+    """Density and colour in the object's frame, where the object lies in the unit sphere around the origin."""
 
     directed: bool = True
     """Whether colour may depend on the viewing direction."""
@@ -45,7 +45,7 @@ class RadianceField(nn.Module, ABC):
     ]:
         """Return ``query`` and its m >= 1 derivatives for positions moving at ``velocities``, directions at ``turns``.
 
-        Under a moving light, colour has ``light_rates`` more derivatives than density; they come last.
+        Under a changing light, colour has ``light_rates`` more derivatives than density; they come last.
 
         The base class uses Jacobian-vector products; a field that knows its own derivative overrides this.
         """
@@ -61,8 +61,8 @@ class RadianceField(nn.Module, ABC):
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
         """Return the distances at which to ``query`` the field along rays of shape (rays, 3).
 
-        They are deterministic (the same rays always give the same distances) and detached. Samples behind a
-        transmittance below ``termination`` may be skipped; at 0, none are.
+        They are deterministic (the same rays always give the same distances) and detached. Samples whose
+        transmittance is below ``termination`` may be skipped; at 0, none are.
         """
 
     def with_step(self, multiple: float) -> RadianceField:
@@ -81,8 +81,8 @@ class RadianceField(nn.Module, ABC):
         """Compute premultiplied colour and opacity of rays (rays, 3) by quadrature on the samples of ``sample``.
 
         It is not differentiable. ``span`` is what the method ``span`` returned for these rays; with ``skip_empty``,
-        space known to be empty is skipped. Neither changes a pixel, and fields that know no empty space ignore both.
-        ``surface``, if given, records where the rays lose half of their light.
+        space known to be empty is skipped. Neither changes a pixel, and fields that do not track empty space ignore
+        both. ``surface``, if given, records where the rays lose half of their light.
         """
         samples = self.sample(rays, termination)
         sigma, rgb = self.query(*sample_points(rays, samples))

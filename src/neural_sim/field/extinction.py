@@ -19,8 +19,8 @@ HALF = math.log(2.0)
 class Extinction:
     """Optical depth that each of ``rays`` rays has gathered so far.
 
-    Samples behind a transmittance of ``termination`` do not count. Each sum runs along one ray only, so that the rays'
-    own dtype keeps enough digits.
+    Samples whose transmittance is below ``termination`` do not count. Each sum runs along one ray only, so that the
+    rays' own dtype keeps enough digits.
     """
 
     def __init__(self, rays: int, termination: float, like: Float[Tensor, "*any"]) -> None:

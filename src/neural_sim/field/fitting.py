@@ -45,8 +45,8 @@ class GridFitting(Fitting):
     At each of ``refine_steps``, empty cells are dropped and the edges of the others are halved; at ``prune_steps``,
     empty cells are dropped. ``resolution`` is the final number of cells along the unit sphere's diameter; with n
     refinements, the first is ``resolution`` / 2^n. A cell stays if it or a neighbour holds a sample that contributes
-    more than ``prune_weight`` (for photographs, ``SPREAD`` times that) to one of ``prune_rays`` pixels. Samples behind
-    a transmittance of ``termination`` are dropped.
+    more than ``prune_weight`` (for photographs, ``SPREAD`` times that) to one of ``prune_rays`` pixels. Samples whose
+    transmittance is below ``termination`` are dropped.
     """
 
     field: GridField

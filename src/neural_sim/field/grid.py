@@ -37,7 +37,9 @@ EMPTY_DENSITY = -1e4
 
 @validated
 class GridField(RadianceField):
-    """A trilinear field over occupied cells; sigma = softplus(gain raw) / cell edge, whatever the grid's scale.
+    """A trilinear field over occupied cells, with sigma = softplus(gain raw) / cell edge.
+
+    A raw value therefore stands for the same optical depth across a cell, whatever the cell's size.
 
     ``features`` numbers at each vertex give the colour. With ``head_width`` 0, the first three pass through a sigmoid
     (no view dependence; a Lambertian object under a fixed light needs none); otherwise, a head with one hidden layer
@@ -91,7 +93,7 @@ class GridField(RadianceField):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
         """Move and cast like any module, but reject a dtype that cannot resolve positions within a cell."""
-        # Nor would half precision pay for colour alone: decoding is 6 % of a render on a CPU.
+        # Half precision for colour alone would not pay either: decoding is 6 % of a render on a CPU.
         wanted = fn(self.table.detach()[:0]).dtype
         if wanted not in (torch.float32, torch.float64):
             raise ValueError(f"GridField: want float32 or float64, got {wanted}")
@@ -117,7 +119,7 @@ class GridField(RadianceField):
     def keep(self, cells: Bool[Tensor, "cells"], refine: bool) -> None:
         """Drop the occupied cells that are not in ``cells``, except neighbours of those that stay.
 
-        With ``refine``, the edge of cells is halved first, so that the margin of neighbours is thinner. The table is
+        With ``refine``, the cells' edges are halved first, so that the margin of neighbours is thinner. The table is
         interpolated at the new vertices.
         """
         wanted, occupied, cell = torch.zeros_like(self.occupied), self.occupied, self.edge
@@ -167,7 +169,7 @@ class GridField(RadianceField):
         velocities: Float[Tensor, "m samples 3"],
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See the base class; without a head in closed form, at little more than the cost of ``query``."""
+        """See the base class; without a head, derivatives are in closed form and cost little more than ``query``."""
         raw, raw_rates = self.raw_with_tangents(positions, velocities)
         sigma_rates = self.density_rates(raw, raw_rates)
         sigma, rgb = self.decode(raw, directions)
@@ -258,7 +260,7 @@ class GridField(RadianceField):
         self, decode: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]], directed: bool, rays: Rays,
         termination: float, span: Span | None, skip_empty: bool, surface: Surface | None,
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:  # fmt: skip
-        """Trace rays with ``decode`` for table rows; ``directed`` says whether it needs the samples' directions."""
+        """Trace rays; ``decode`` turns table rows into density and colour, and needs directions if ``directed``."""
         colour = rays.origins.new_zeros(len(rays.origins), 3)
         extinction = Extinction(len(rays.origins), termination, rays.origins)
 

@@ -18,11 +18,14 @@ from neural_sim.types import PosedViews
 COARSEST = 32
 Resolution = Annotated[
     int,
-    Matching(lambda cells: cells >= COARSEST and cells & (cells - 1) == 0, f"a power of two from {COARSEST}"),
+    Matching(
+        lambda cells: cells >= COARSEST and cells & (cells - 1) == 0, f"a power of two of at least {COARSEST}"
+    ),
 ]
 """Number of cells along the unit sphere's diameter, such that they can be carved coarse to fine."""
 DISSENT = 0.1
-"""Largest fraction of the photographs of a cell that may show no object there, as poses and masks are not exact."""
+"""A cell stays if at most this fraction of the photographs that show it have no object there, because poses and masks
+are inexact."""
 
 
 def visual_hull(

@@ -1,7 +1,7 @@
 """Trilinear interpolation in a packed table, with rows only for vertices of occupied cells.
 
-An array of corners has the rows of each cell. On a CPU, interpolation is one ``index_select`` and one small batched
-product; 3-D ``grid_sample`` is about ten times slower and has no forward-over-reverse derivatives.
+An array of corners lists the eight rows of each cell. On a CPU, interpolation is one ``index_select`` and one small
+batched product; 3-D ``grid_sample`` is about ten times slower and has no forward-over-reverse derivatives.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ def trilinear_tangents(
 ) -> tuple[Float[Tensor, "samples 8"], Float[Tensor, "m samples 8"]]:
     """Compute ``trilinear_weights``, and their derivatives for a fraction that moves at ``velocities``.
 
-    Each operation runs over all samples of one coordinate, so that its memory is contiguous. Not differentiable.
+    Each operation runs over all samples of one coordinate, so that its memory is contiguous. The results are not
+    differentiable.
     """
     x, y, z = fraction.detach().t().contiguous().unbind(0)
     edges = _bilinear(x, y)

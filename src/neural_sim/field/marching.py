@@ -31,9 +31,9 @@ Axes = tuple[Tensor, Tensor, Tensor]
 class Wave:
     """The next ``length`` lattice steps of n rays, of which k lie in occupied cells.
 
-    ``ray`` numbers the rays; ``row`` is each sample's index in ``ray`` and ``place`` its index among the n x length
-    steps, both in increasing order; ``count`` is the number of each ray's samples. ``fraction`` is the position inside
-    the cell, x, y and z in [0, 1].
+    ``ray`` holds the rays' indices; ``row`` is each sample's index in ``ray`` and ``place`` its index among the n x
+    length steps, both in increasing order; ``count`` is the number of each ray's samples. ``fraction`` is the position
+    inside the cell, x, y and z in [0, 1].
     """
 
     length: int
@@ -198,8 +198,8 @@ def _leap(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Return distances to the nearest occupied coarse cell, and the first lattice steps beyond known empty space.
 
-    A ray whose coarse cell is d > 0 cells from the nearest occupied one may jump to the exit of the cube of
-    d - 1 cells around its own.
+    A ray whose coarse cell is d > 0 cells from the nearest occupied one may jump to the exit of the cube that extends
+    d - 1 coarse cells beyond its own on every side.
     """
     travelled = (ahead + walk.phase) * unit
     local = tuple(axis / COARSENING for axis in walk.at(travelled))

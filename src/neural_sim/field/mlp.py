@@ -73,8 +73,8 @@ class MLPField(RadianceField):
     """Two networks: the coarse one decides where along a ray the fine one is sampled.
 
     ``query`` uses the fine network. ``coarse_samples`` uniform samples span the ray's part in the unit sphere;
-    ``fine_samples`` more are drawn in proportion to the coarse weights (NeRF, Sec. 5.2), at even quantiles so that
-    ``sample`` is deterministic. ``density_scale`` times softplus is the density per object radius.
+    ``fine_samples`` more are drawn in proportion to the coarse weights (NeRF, Sec. 5.2), at evenly spaced quantiles
+    so that ``sample`` is deterministic. ``density_scale`` times softplus is the density per object radius.
     """
 
     def __init__(

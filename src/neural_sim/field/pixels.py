@@ -16,7 +16,7 @@ from neural_sim.types import PinholeCamera
 
 SMALLEST_STRIP, LARGEST_STRIP = 2048, 16384
 """Smallest and largest number of pixels of an image that are processed together, in whole rows, so that a large image
-needs no more memory than a small one. The largest is a CPU's; see ``at_once`` for other devices."""
+needs no more memory than a small one. The largest is for a CPU; see ``at_once`` for other devices."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """Samples along rays without padding, and volume rendering by quadrature over them, as pure functions.
 
-The quadrature is Max's (1995; NeRF, Mildenhall et al. 2020, Eq. 3). Sums over a ray are differences of one running sum
-over all samples; unlike a scatter, it is fast on a CPU and has both derivative modes. It runs in float64, and no sample
-counts for more than ``OPAQUE_DEPTH``, so that rays late in the pack keep their precision: the error for N samples is at
-most N times the float64 eps times the sum of their counted depths.
+The quadrature is Max's (1995; NeRF, Mildenhall et al. 2020, Eq. 3). Sums over a ray, except in ``_segment_sum``,
+are differences of one running sum over all samples, which has both derivative modes. The running sum is in float64, and
+no sample counts for more than ``OPAQUE_DEPTH``, so that rays late in the pack keep their precision: the error for N
+samples is at most N times the float64 eps times the sum of their counted depths.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OPAQUE_DEPTH = 50.0
 class PackedSamples:
     """Samples of many rays without padding, sorted by ray and then by distance (the layout of nerfacc).
 
-    ``ray`` numbers the ray of each sample; ``distance`` is along the ray's unit direction in object radii;
+    ``ray`` is the index of each sample's ray; ``distance`` is along the ray's unit direction in object radii;
     ``width`` is the length of ray that the sample represents. Ray r owns the samples ``starts[r]:starts[r + 1]``.
     """
 
@@ -90,7 +90,7 @@ def sum_rays(
 def _running(values: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples channels"]:
     """Compute running sums over samples, channel by channel except on a CPU.
 
-    CUDA adds the rows of a matrix sequentially, but a single row in parallel.
+    CUDA accumulates the rows of a matrix one after the other, but the numbers of a vector in parallel.
     """
     if values.device.type == "cpu":
         return values.cumsum(0)
@@ -155,12 +155,13 @@ def composite_with_gradient(
 ]:
     """Compute ``composite`` as RGBA, and its derivatives.
 
-    The first three rates are the derivatives by x, y and z. The other q = n - 3 change only colour; their densities, if
-    any, are ignored. The derivatives returned are, in order: by a shift of all samples of a ray along x, y or z; by
-    such a shift in proportion to the samples' distances; and, of colour alone, by the q other rates.
+    The first three rates are the derivatives with respect to x, y and z. The other q = n - 3 change only colour; their
+    densities, if any, are ignored. The derivatives returned are those with respect to a shift of all samples of a ray
+    along x, y or z; those with respect to such a shift in proportion to the samples' distances; and those of colour
+    alone at the q other rates.
 
     Density adds a sample's own colour, as far as light passes through the sample, and hides what is behind it: with
-    tau = sigma delta, the pixel's derivative by tau is T exp(-tau) c - sum_{j behind} w_j c_j.
+    tau = sigma delta, the pixel's derivative with respect to tau is T exp(-tau) c - sum_{j behind} w_j c_j.
     """
     depth, weights, passed = _passage(sigma, samples)
     weights = weights[:, None]

@@ -46,7 +46,8 @@ class FieldRecipe:
         steps: budget of optimiser steps.
         final_rate: final learning rates as a fraction of the initial ones; they fall exponentially.
         score_every: number of steps between scores on the held-out views; 0: only at the end.
-        seed: seed of new weights and the order of rays; separate from the run's seed, so that runs share fields.
+        seed: seed of the order of rays and of new weights, except those of ``MLPField``, which has a seed of its own;
+            separate from the run's seed, so that runs share fields.
     """
 
     field: Callable[[], RadianceField]
@@ -91,7 +92,7 @@ def fit_field(
     final_rate: float = 0.1,
     score_every: int = 0,
 ) -> tuple[RadianceField, list[dict[str, float]]]:
-    """Fit ``fitting.field`` to all but the last ``held_out`` views, which score it (see ``RadianceFieldModule``).
+    """Fit ``fitting.field`` to all but the last ``held_out`` views, on which it is scored (``RadianceFieldModule``).
 
     Returns the field, in evaluation mode and without gradients, and its history.
 
@@ -234,7 +235,7 @@ class RadianceFieldModule(lightning.LightningModule):
         if last and not math.isfinite(float(loss.detach())):
             raise ValueError(
                 f"field: the loss is {float(loss.detach())} after {self.steps} steps: want smaller learning rates "
-                "(field.fitting.learning_rate and those of its parts)"
+                "under field.fitting"
             )
         if last or (self.score_every and self._steps_done % self.score_every == 0):
             self._score()

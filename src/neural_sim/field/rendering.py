@@ -22,7 +22,8 @@ from neural_sim.field.quadrature import (
 from neural_sim.types import PinholeCamera, Rays
 
 FEW = 2
-"""Largest number of rates propagated one by one through the samples; more share derivatives by origin and direction."""
+"""Largest number of rates that are propagated one by one through the samples; more than that share the derivatives with
+respect to origin and direction."""
 SAMPLES_AT_ONCE = 16_384
 """Number of samples that are differentiated together on a CPU, so that they fit its cache."""
 
@@ -49,7 +50,7 @@ def render_with_tangents(
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
     """Compute premultiplied RGBA of rays (rays, 3), and derivatives for rays moving at ``rates`` (m, rays, 3).
 
-    Derivatives by a moving light (see ``RadianceField.light_rates``) follow these m.
+    The derivatives for a changing light (see ``RadianceField.light_rates``) follow these m.
 
     One pass over the samples, about ``samples_at_once`` at a time, gives pixels and derivatives: a sample at distance t
     moves at o' + t d'. Many rates cost little more than a few (see ``_by_ray_numbers``).
@@ -88,8 +89,8 @@ def _by_ray_numbers(
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
     """Render like ``_with_tangents``, through the spatial derivatives at each sample.
 
-    Summed along a ray, they are the pixel's derivatives by the ray's origin; weighted by distance, those by its
-    direction.
+    Summed along a ray, they are the pixel's derivatives with respect to the ray's origin; weighted by distance, those
+    with respect to its direction.
     """
     positions, directions = sample_points(rays, samples)
     unit = torch.eye(3, dtype=positions.dtype, device=positions.device)[:, None].expand(-1, len(samples), -1)

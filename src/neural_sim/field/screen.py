@@ -14,7 +14,7 @@ from neural_sim.field.occupancy import COARSENING, Occupancy
 from neural_sim.types import PinholeCamera
 
 BLOCKS = 4
-"""Least number of pixel blocks that a large ball covers to each side: larger blocks would include rays far from it."""
+"""Least number of pixel blocks from a large ball's centre to its edge: larger blocks would include rays far from it."""
 
 
 def coarse_centres(occupancy: Occupancy) -> tuple[Float[Tensor, "3 cells"], float]:
@@ -35,9 +35,9 @@ def screen_span(
     """Return distances between which rays of the image's ``rows`` can meet balls of ``radius`` around ``centres``.
 
     The interval is never too narrow; near > far if a pixel sees no ball. Each ball is drawn as the block of pixels at
-    its centre, with its nearest and farthest distance; all are then widened by as many blocks as the largest ball
-    covers to each side. Blocks grow with the balls, so that a large image needs no more memory than a small one. If a
-    ball touches the camera plane or covers more than the image, every pixel gets all distances.
+    its centre, with its nearest and farthest distance; all are then widened on each side by as many blocks as the
+    largest ball's radius covers. Blocks grow with the balls, so that a large image needs no more memory than a small
+    one. If a ball touches the camera plane or covers more than the image, every pixel gets all distances.
     """
     rotation, position = camera_to_world[:3, :3], camera_to_world[:3, 3]
     x, y, z = (rotation.t() @ (centres - position[:, None])).unbind(0)

@@ -28,7 +28,7 @@ from neural_sim.objects.pictures import Corners
 RAYS = 98_304
 """Number of pixels whose rays find the scene's surface."""
 DETAILED = 3
-"""One in this many of the surface's points, those of the pixels with most detail, are searched for the plane."""
+"""The search for the plane uses one in this many of the surface's points: those of the pixels with the most detail."""
 FAINT = 0.05
 """A box counts as empty if no cell in it contributes more than this to any pixel."""
 THICK = 0.75
@@ -115,7 +115,7 @@ def find(
 def _boxed(
     grid: SceneGrid, largest: Float[Tensor, "cells"], plane: Plane | None, frame: Frame, box: Corners
 ) -> Region | None:
-    """Find everything in the box above the plane, if that is below the box's centre; None if nothing is solid."""
+    """Find what is in the box above the plane (ignored if above the box's centre); None if nothing is solid."""
     low, high = (frame.into(torch.tensor(corner)) for corner in box)
     if plane is not None and float(plane.height(0.5 * (low + high))) < 0.0:
         plane = None  # the box's centre is below it, so it cannot support the object

@@ -27,7 +27,7 @@ STANDING = 0.02
 CAMERAS = 0.9
 """Smallest fraction of the cameras that must be above a supporting plane."""
 SHOWING = 0.5
-"""Most points just below a supporting plane, relative to those on it: a plane through an object has more."""
+"""Largest ratio of points just below a supporting plane to points on it: a plane through an object has a larger one."""
 ATTEMPTS = 4
 JUST = 4.0
 """Points 1 to this many tolerances below a plane are evidence against it, because a support is opaque."""
@@ -66,7 +66,7 @@ def supporting_plane(
 ) -> Plane | None:
     """Find the plane below the object at the origin; None if there is none. All inputs are in the normalised frame.
 
-    RANSAC (Fischler and Bolles 1981) finds, from random samples of three points, the plane with most points within
+    RANSAC (Fischler and Bolles 1981) finds, from random samples of three points, the plane with the most points within
     ``tolerance`` and few just below it, which is then fitted by least squares. Most cameras must be above it, and
     something must stand on it near the origin. The plane must extend farther than what stands on it; the top of a box
     or the foot of a lamp does not.

@@ -27,7 +27,7 @@ REACH = 1.5
 LARGE = 0.1
 """Connected parts with less than this fraction of the largest part's cells are errors of the field."""
 FARTHEST = 0.9
-"""Largest distance from the origin at which an object may end."""
+"""Largest distance at which an object may end: from the origin, or from the axis through it if there is a plane."""
 LEAST = 8
 """Smallest number of solid cells in an object."""
 EMPTIER = 0.5
@@ -41,7 +41,7 @@ GROUND = 1.0
 BULGE = 4.0
 """Height in cells up to which the surface of a plane without texture bulges towards the cameras."""
 SOFT = 0.6
-"""Largest density of a bulge, relative to the object's median density above all bulges."""
+"""Largest fraction that a bulge's cells absorb, relative to the median of the object's cells above all bulges."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def connected_region(
         return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
     centres = expand(cell_centres(grid.resolution))
     distance = centres.norm(dim=-1) if plane is None else plane.from_axis(centres)
-    # With large cells or few steps, some rays also end in the air, so a solid cell must end more of them.
+    # With large cells or few steps, some rays also end in the air, so more of them must end in a solid cell.
     for least in (HITS, 2 * HITS, 4 * HITS, 8 * HITS, math.inf):
         solid = (shows | (surface.hits >= least)) & allowed
         reach = _apart(distance[solid], 3 if plane is None else 2, grid.edge)
@@ -108,7 +108,7 @@ def connected_region(
 
 
 def _apart(distance: Float[Tensor, "solid"], dimensions: int, edge: float) -> float | None:
-    """Find the distance from the origin at which the object ends; None if no gap surrounds it.
+    """Find the ``distance`` at which the object ends; None if no gap surrounds it.
 
     The density of solid cells in rings two cells wide is compared with the density inside them: around an object, there
     is a ring that is much emptier, even if an error of the field bridges it.
@@ -169,7 +169,7 @@ def without_bulges(grid: SceneGrid, surface: SeenSurface, region: Region) -> Reg
     """Take the bulges of the plane's surface out of a region.
 
     Photographs from one side leave the height of a plane without texture uncertain, so that its surface bulges between
-    the feet of the object, by more than a cell, but is less dense than the object. An object that is no higher than
+    the feet of the object, by more than a cell, but absorbs less than the object. An object that is no higher than
     a bulge keeps its cells.
     """
     if region.plane is None:

@@ -12,15 +12,15 @@ from torch import Tensor
 from neural_sim.objects.placing import nearest_to_axes
 
 NEAR = 0.4
-"""Start of rays, as a fraction of their camera's distance from the origin. Nearer, a field could place a separate
-picture in front of each camera, and photographs of an object show nothing there."""
+"""Start of rays, as a fraction of their camera's distance from the origin. Closer to the cameras, a field could place
+a separate picture in front of each, and photographs of an object show nothing there."""
 FAR = 100.0
 """End of rays: everything farther is contracted into a shell of thickness 1 / FAR."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The normalised frame: the capture's, shifted by -``centre`` and divided by ``unit``, both in the capture's."""
+    """The capture's frame, shifted by -``centre`` and then divided by ``unit``, both in the capture's unit."""
 
     centre: tuple[float, float, float]
     unit: float

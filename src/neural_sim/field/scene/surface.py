@@ -24,8 +24,8 @@ class SeenSurface:
     ``points`` are the places where rays have lost half of their light, in the normalised frame; ``hits`` is their
     number in each of the grid's cells; ``largest`` is the largest contribution of each cell to any pixel.
 
-    A field with few steps spreads a surface over several cells, each of which contributes little; but the point where
-    half of the light is lost remains well defined.
+    A field fitted in few steps spreads a surface over several cells, each of which contributes little; but the point
+    where half of the light is lost remains well defined.
     """
 
     points: Float[Tensor, "hits 3"]
