@@ -112,7 +112,7 @@ def whole_run(made: Experiment, budget: Mapping[str, Any], parts: Mapping[str, f
         "an iteration: images, and their derivative by the second pass": images * rays * (render + twice),
         "an iteration: training": images * (made.loop.outer.epochs * frozen + trained / 3.0),
         "an iteration: the solve": images * PRODUCTS * product,
-        "an iteration: derivative by the images": images * 2.5 * trained,
+        "an iteration: derivative with respect to the images": images * 2.5 * trained,
     }
     scored = 3 * made.training.cold_epochs * OBJECTS * made.training.images_per_object
     return {

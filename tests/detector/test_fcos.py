@@ -129,7 +129,7 @@ def test_hessian_products_are_central_differences_of_gradients(tools, generator)
 
 
 def test_smooth_ap_falls_along_its_gradient(tools, generator):
-    """Its derivative by all outputs, in float64, against a central difference; centre-ness counts in the ranks."""
+    """Its derivative with respect to all outputs, against a central difference; centre-ness counts in the ranks."""
     detector, images, smooth = make_fcos(), large_boxes(tools), SmoothAP(width=0.3)
     backbone, trainable = detector.split(tools.noisy(detector.init(generator), generator))
     features = detector.features(backbone, images.images)

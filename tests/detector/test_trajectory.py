@@ -75,7 +75,7 @@ def test_adamws_pull_back_is_the_formula_written_out(generator):
 
 
 def test_an_entry_that_never_had_a_gradient_has_a_finite_pull_back():
-    """There the step is m / (c1 eps): its derivative by the gradient is -rate / eps, by the second moment none."""
+    """There the step is m / (c1 eps), whose derivative is -rate / eps for the gradient, and 0 for the second moment."""
     rule, zero = AdamW(0.0), torch.zeros(1, dtype=DOUBLE)
     one = torch.ones(1, dtype=DOUBLE)
     earlier, along = pulled_back(rule, rule.begin(one), zero, 1e-2, 0, (one, zero, zero))

@@ -1,4 +1,4 @@
-"""Fields with appearance codes: geometry that no code moves, derivatives by code and camera, saving."""
+"""Fields with appearance codes: geometry that no code moves, derivatives with respect to code and camera, saving."""
 
 from pathlib import Path
 

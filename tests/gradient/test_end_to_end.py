@@ -70,7 +70,7 @@ def test_patches_and_tangents_agree_on_the_field(pipeline):
 
 
 def against_central_differences(scene, part, psi, generator):
-    """The derivative by psi of the part's maps times random cotangents."""
+    """The derivative with respect to psi of the part's maps times random cotangents."""
     maps = Maps(
         *(torch.randn(value.shape, generator=generator, dtype=DOUBLE) for value in (part.rgb, part.opacity))
     )

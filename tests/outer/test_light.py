@@ -1,4 +1,4 @@
-"""The derivative by the weights of lights, through the loop's own binding, against central differences."""
+"""The derivative with respect to the weights of lights, through the loop's own binding, against central differences."""
 
 import dataclasses
 import math

@@ -23,7 +23,7 @@ COST = torch.tensor([[0.3, 0.1, 0.5, 0.2], [0.2, 0.2, 0.2, 0.2]], dtype=torch.fl
 
 
 class Result:
-    """A derivative by logits with the same standard error everywhere."""
+    """A derivative with respect to logits with the same standard error everywhere."""
 
     def __init__(self, gradient, error):
         self.gradients = dict(zip(NAMES, gradient, strict=True))

@@ -43,7 +43,7 @@ def proposed(steps, gradient, error, level=0.05):
 
 
 def gradients(target, psi):
-    """Of minus the mean score, for bins that score 1 at ``target``: the derivative by logits in closed form."""
+    """Derivative of minus the mean score by logits, in closed form, for bins that score 1 at ``target``."""
     above = POSE.p_of(psi) - POSE.floor
     scores = torch.zeros_like(above)
     scores[range(len(above)), target] = 1.0
@@ -82,7 +82,7 @@ def test_a_step_leaves_each_bin_the_fraction_that_the_settings_say(keep):
 
 
 def test_directions_are_derivatives_by_p_where_a_bin_is_at_the_floor():
-    """Derivatives by logits are p - floor times those by p: over p, that of a bin at the floor would be near 0."""
+    """Logits' derivatives are p - floor times those of p: divided by p, that of a bin at the floor would be near 0."""
     floored = BinnedFactor("pose", "phi", 4, 0.0, 2 * math.pi, floor=0.005)
     psi = torch.tensor([[4.0, 0.0, 0.0, -8.0], [0.0, 0.0, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
     scores = torch.tensor([[0.0, 0.0, 0.5, 1.0], [0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The renderer of fields with appearance codes: weights of anchors, and derivatives by camera and weights."""
+"""The renderer of fields with appearance codes: weights of anchors; derivatives of camera and weights."""
 
 import math
 

@@ -1,1 +1,1 @@
-"""Hypergradients: adjoints (implicit, unrolled), and estimators of the derivative by psi."""
+"""Hypergradients: adjoints (implicit, unrolled), and estimators of the derivative with respect to psi."""

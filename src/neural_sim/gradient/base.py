@@ -1,4 +1,4 @@
-"""Inputs and results of the estimators of derivatives by psi.
+"""Inputs and results of the estimators of derivatives with respect to psi.
 
 For the implicit adjoint they estimate ``d/dpsi <dL_train/dtheta, v>``, without the minus sign of the implicit function
 theorem, which ``gradient.implicit`` applies. For the unrolled adjoint they estimate ``dL_val/dpsi`` itself.
@@ -101,11 +101,11 @@ class ObjectImages:
 
 @dataclass(frozen=True)
 class MixedDerivative:
-    """One object's derivative by psi, as ``Estimator.estimate`` or ``Estimator.accumulated`` defines it.
+    """One object's derivative with respect to psi, as ``Estimator.estimate`` or ``Estimator.accumulated`` defines it.
 
     ``standard_error`` is the error of ``value`` over draws of the images, with v (or the recorded training) fixed; inf
-    if unknown. ``p_values`` has, for each factor of psi, the p-value of the null hypothesis that the derivative by the
-    factor is zero, over the same draws; it is empty if nothing was tested.
+    if unknown. ``p_values`` has, for each factor of psi, the p-value of the null hypothesis that the derivative with
+    respect to the factor is zero, over the same draws; it is empty if nothing was tested.
     """
 
     value: Float[Tensor, "K"]

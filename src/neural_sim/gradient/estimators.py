@@ -30,7 +30,7 @@ LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 
 
 class Estimator(Protocol):
-    """An estimator of the derivative by psi.
+    """An estimator of the derivative with respect to psi.
 
     ``wanted`` names the sums over a training's steps that ``accumulated`` reads.
     """
@@ -175,7 +175,7 @@ def stratified(
 def by_strata(
     scores: Float[Tensor, "n"], factor: Factor, psi: Float[Tensor, "k"], weight: float = 1.0
 ) -> MixedDerivative:
-    """Estimate the derivative by one factor's psi from the scores of its probes, which are ordered by stratum.
+    """Estimate the derivative with respect to one factor's psi from its probes' scores, ordered by stratum.
 
     Bins use ``stratified``, lights ``across_lights``.
     """
@@ -192,10 +192,10 @@ def across_lights(table: Float[Tensor, "k n"], weight: float = 1.0) -> MixedDeri
     would remove it in any case.
 
     This is not the derivative of the training loss by psi: psi blends the lights in every image, and
-    ``gradient=pathwise`` computes the derivative by that blend. It is the derivative for another training set, in which
-    each image has a single light, and a fraction w_i of the images has light i. The derivative by the blend says little
-    about a large change of light: a detector that never saw a light gains nothing from a trace of it. docs/numerics.md,
-    Lights, compares both with the actual fall of the loss.
+    ``gradient=pathwise`` computes the derivative with respect to that blend. It is the derivative for another training
+    set, in which each image has a single light, and a fraction w_i of the images has light i. The derivative with
+    respect to the blend says little about a large change of light: a detector that never saw a light gains nothing from
+    a trace of it. docs/numerics.md, Lights, compares both with the actual fall of the loss.
 
     Raises:
         ValueError: there is no scene.

@@ -2,9 +2,9 @@
 
 Reverse mode is the paper's. The first forward pass renders images without derivatives; then v and the images'
 cotangents are computed. The second forward pass renders the rays of the same draw patch by patch; after each patch, a
-backward pass adds to the derivatives by V, a few numbers for each image. Forward mode needs neither a second render nor
-patches: because V has only a few numbers, the first render also computes the derivatives of the images by each, and the
-cotangents are contracted with them. In both modes the draw is differentiated by psi once, at the end.
+backward pass adds to the derivatives with respect to V, a few numbers for each image. Forward mode needs neither a
+second render nor patches: because V has only a few numbers, the first render also computes the images' derivatives with
+respect to each, and the cotangents are contracted with them. In both modes the draw is differentiated once, at the end.
 """
 
 from __future__ import annotations
@@ -113,7 +113,8 @@ class PathwiseEstimator:
         maps = map_cotangents(path, cotangents)
         along_draw = contract(path.tangents or {}, maps)
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
-            # The first render always computes derivatives by the lights, but only in forward mode those by coordinates.
+            # The first render always computes derivatives with respect to the lights, but only in forward mode those by
+            # coordinates.
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
         # From here on there are only a few numbers per image; they are on the CPU, like psi and the draws.
         along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
@@ -183,7 +184,7 @@ def psi_contributions(
     psi: Float[Tensor, "K"],
     cotangents: Mapping[str, Float[Tensor, "n"]],
 ) -> Float[Tensor, "n K"]:
-    """Compute each image's contribution to the derivative by psi, by pulling cotangents back through Tool 1's draw.
+    """Compute each image's part of the derivative with respect to psi: pull cotangents back through Tool 1's draw.
 
     Rows sum to the vector-Jacobian product; the standard error needs them separately. psi has fewer numbers than there
     are images, so forward mode, with one pass for each number of psi, is the cheaper way to compute all rows.

@@ -27,8 +27,8 @@ from neural_sim.solver.operator import flatten, plain_norm, unflatten
 
 Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
 Wanted = Literal["probes", "weights", "inputs"]
-"""Which sums an estimator reads: ``probes``: the probes' scores only; ``weights``: also derivatives by the training
-images' weights; ``inputs``: also those by the images' inputs."""
+"""Which sums an estimator reads: ``probes``: the probes' scores only; ``weights``: also derivatives with respect to the
+training images' weights; ``inputs``: also those with respect to the images' inputs."""
 InputsOf = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 """Computes a training's inputs from images and their rows."""
 

@@ -1,7 +1,7 @@
 """The hypergradient of the training that was actually run.
 
 ``gradient.reversal`` reverses its steps. Estimators read sums over these steps: scores of images and probes, and
-derivatives by the training's inputs.
+derivatives with respect to the training's inputs.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Accumulated:
     Attributes:
         images: derivatives of L_val by the training images' weights, with which each image counts in the mean over its
             batch (1 in the training that was run); empty unless wanted.
-        inputs: derivatives by the training images' inputs; empty unless wanted.
+        inputs: derivatives with respect to the training images' inputs; empty unless wanted.
         probes: each probe's score, estimated from the steps that scored it. The mean over the probes of a bin is
             unbiased for ``sum_t f_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group; f_t is
             the fraction of step t's batch that was drawn from p_psi.
@@ -69,10 +69,12 @@ class Accumulated:
         ``images`` belong to the rows ``index``; ``chunk_size`` of them are differentiated at a time.
 
         Raises:
-            ValueError: derivatives by the inputs were not accumulated.
+            ValueError: derivatives with respect to the inputs were not accumulated.
         """
         if not self.inputs or self.inputs_of is None:
-            raise ValueError("unrolled: want the derivative by the inputs, which was not accumulated")
+            raise ValueError(
+                "unrolled: want the derivative with respect to the inputs, which was not accumulated"
+            )
         parts: list[Tensor] = []
         for rows, chunk in zip(torch.split(index, chunk_size), torch.split(images, chunk_size), strict=True):
             rows = rows.to(self.inputs[0].device)

@@ -39,8 +39,8 @@ class Trust:
     The adjoint's own conditions are settings of ``outer.adjoint``.
 
     Args:
-        level: significance level of the test whether an object's derivative by a factor is zero (free steps: see
-            ``gradient.significance``; trust region: ``outer.evidence``); None: not tested.
+        level: significance level of the test whether an object's derivative with respect to a factor is zero (free
+            steps: see ``gradient.significance``; trust region: ``outer.evidence``); None: not tested.
         min_cosine: smallest cosine of the hypergradient with the finite-difference response of training (needs
             ``outer.certify_every``); None: no limit.
         on_untrusted: what happens to steps that fail: those of one object and factor if the derivative is not

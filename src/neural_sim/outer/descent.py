@@ -283,7 +283,7 @@ class GradientLoop(OuterLoop, ABC):
 
     @abstractmethod
     def _derivative(self, trained: Trained, objective: Objective) -> Hypergradient:
-        """Compute the objective's derivative by the psi of the learned objects; it is zero for the others."""
+        """Compute the objective's derivative with respect to psi; it is zero for objects that are not learned."""
 
     def _cosine(self, result: Hypergradient) -> float | None:
         """Compute the cosine of the derivative with an independent reference; None if there is none."""

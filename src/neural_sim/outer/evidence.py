@@ -11,7 +11,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Average:
-    """Weighted mean of derivatives by p, object by object; weights are inverse variances and decay as psi moves.
+    """Weighted mean of derivatives with respect to p, object by object.
+
+    Weights are inverse variances and decay as psi moves.
 
     Inverse variances keep noisy derivatives, which are long, from dominating the mean; the decay discounts those that
     were taken at an earlier psi. A derivative's variance has two parts: its variance over the images from which it was

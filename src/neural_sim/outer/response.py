@@ -48,7 +48,7 @@ class Response:
     cost: Cost = field(default_factory=Cost)
 
     def slopes(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "objects K"]:
-        """Compute the derivative by psi that the response implies, where L_val is minus the mean score over classes."""
+        """Compute the derivative with respect to psi that the response implies; L_val is minus the mean class score."""
         distribution, parts = inner.scene.distribution, {}
         values, at = distribution.split(self.value), distribution.split(psi)
         for factor in distribution.factors:
@@ -106,8 +106,8 @@ def agreement(
     """Compare derivatives at ``psi`` with the ``slopes`` of the response.
 
     Returns:
-        The cosine of the centred derivatives by p, averaged over learned objects and factors; None if it is undefined
-        for all of them, because a derivative vanishes.
+        The cosine of the centred derivatives with respect to p, averaged over learned objects and factors; None if it
+        is undefined for all of them, because a derivative vanishes.
     """
     distribution = objects.distribution
     truth = distribution.split(slopes)

@@ -219,9 +219,9 @@ def slopes_by_p(
 ) -> tuple[Float[Tensor, "objects k"], Float[Tensor, "objects k"]]:
     """Convert the derivative of L_val by psi to the derivative of minus L_val by a factor's p, centred.
 
-    The derivative by logits is (p - floor) times the one by p (up to a constant), so that steps along it would hardly
-    move a bin of small p. ``error`` has the standard errors of ``gradient``; the second result has the variances of the
-    first.
+    The derivative with respect to logits is (p - floor) times the one by p (up to a constant), so that steps along it
+    would hardly move a bin of small p. ``error`` has the standard errors of ``gradient``; the second result has the
+    variances of the first.
     """
     # log_slopes are -inf in closed bins, where the gradient is 0.
     scale = factor.log_slopes(psi).exp().clamp_min(torch.finfo(psi.dtype).tiny)

@@ -72,8 +72,8 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Compute log w for w = p - ``floor``, without cancellation.
 
-    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)); divided by w, it is the derivative by p, up to a
-    constant. Divided by p instead, it would vanish for bins at the floor.
+    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)); divided by w, it is the derivative with respect to
+    p, up to a constant. Divided by p instead, it would vanish for bins at the floor.
     """
     closed = is_closed(psi)
     if not bool(closed.any()):

@@ -117,7 +117,10 @@ class Factor(Protocol):
         ...
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Compute log w: a derivative by psi, divided by w, is the derivative by p up to a constant; 0 for lights."""
+        """Compute log w; it is 0 for lights.
+
+        A derivative with respect to psi, divided by w, is the one with respect to p, up to a constant.
+        """
         ...
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:

@@ -129,7 +129,7 @@ class Illumination:
         return psi
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Return 0, because derivatives by psi are derivatives by the weights."""
+        """Return 0, because derivatives with respect to psi are derivatives with respect to the weights."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:

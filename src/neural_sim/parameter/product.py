@@ -361,7 +361,7 @@ class SceneDistribution:
 class RelaxedDraws:
     """Draws that depend smoothly on psi, for the pathwise estimator.
 
-    ``tangents``: also render the images' derivatives by those coordinates of a draw that depend on psi.
+    ``tangents``: also render the images' derivatives with respect to those coordinates of a draw that depend on psi.
     """
 
     tangents: bool = False

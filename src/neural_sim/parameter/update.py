@@ -101,11 +101,11 @@ class SGD:
 class Mirror:
     """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
 
-    In logits, the direction is the gradient by p (the gradient by the logits divided by p - floor), centred: a bin of
-    small p takes as long a step as one of large p. Momentum averages the direction. The average is divided by the
-    largest value so far of its root mean square over all objects and bins, so that ``learning_rate`` is in logits per
-    step whatever the units of the loss, and steps shorten with the gradient. (A scale that decays would amplify the
-    small gradients near the end, and objects without a gradient would drift.)
+    In logits, the direction is the gradient with respect to p (that with respect to the logits divided by p - floor),
+    centred: a bin of small p takes as long a step as one of large p. Momentum averages the direction. The average is
+    divided by the largest value so far of its root mean square over all objects and bins, so that ``learning_rate`` is
+    in logits per step whatever the units of the loss, and steps shorten with the gradient. (A scale that decays would
+    amplify the small gradients near the end, and objects without a gradient would drift.)
 
     With ``shrink``, each component of the average is multiplied by ``shrinkage`` (James and Stein 1961, positive part):
     components within their noise do not move. A component whose standard error is not finite is not shrunk.

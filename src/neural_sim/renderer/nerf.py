@@ -1,4 +1,4 @@
-"""Render images of a radiance field, and their derivatives by the camera or the rays."""
+"""Render images of a radiance field, and their derivatives with respect to the camera or the rays."""
 
 from __future__ import annotations
 
@@ -129,9 +129,9 @@ class NerfRenderer:
     ) -> tuple[Maps, list[Maps]]:
         """Render like ``render``, with m derivatives for cameras that move at ``rates``.
 
-        Derivatives by a moving light follow, if the field has one. Ray directions keep unit length whatever the rates,
-        so that the rates may include that of a focal length. One pass computes values and derivatives; beyond the maps,
-        it takes the memory of ``rays_per_chunk`` rays.
+        Derivatives with respect to a changing light follow, if the field has one. Ray directions keep unit length
+        whatever the rates, so that the rates may include that of a focal length. One pass computes values and
+        derivatives; beyond the maps, it takes the memory of ``rays_per_chunk`` rays.
         """
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)
         value = camera_to_world.new_zeros(shape)

@@ -1,4 +1,4 @@
-"""Render images of a field with appearance codes, and their derivatives by camera and light."""
+"""Render images of a field with appearance codes, and their derivatives with respect to camera and light."""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ class RenderedObject:
     """m renders of one object alone: premultiplied colour and opacity, and the scene parameters of each render.
 
     ``noise`` reproduces the draw; it is None if that is not possible, as for pools, probes and pictures. ``relaxed`` is
-    None for hard draws. ``tangents``, if rendered, are the maps' derivatives by the named numbers of the draw.
+    None for hard draws. ``tangents``, if rendered, are the maps' derivatives with respect to the named numbers of the
+    draw.
     """
 
     draw: SceneDraw

@@ -1,4 +1,4 @@
-"""How images depend on psi: which numbers of a draw depend on it, and the camera's derivatives by each."""
+"""How images depend on psi: which numbers of a draw depend on it, and the camera's derivatives with respect to each."""
 
 from __future__ import annotations
 

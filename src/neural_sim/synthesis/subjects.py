@@ -32,8 +32,8 @@ CPU = torch.device("cpu")
 class Subject(Protocol):
     """One object of a scene. It draws itself alone, from p_psi; the scene composes it with others and a background.
 
-    All kinds have exact draws. Only a ``FieldSubject`` has draws with derivatives by psi (``RelaxedDraws``); other
-    kinds refuse them with a ``ValueError``.
+    All kinds have exact draws. Only a ``FieldSubject`` has draws with derivatives with respect to psi
+    (``RelaxedDraws``); other kinds refuse them with a ``ValueError``.
     """
 
     @property
@@ -178,7 +178,7 @@ class RenderedSubject(ABC):
 
 @dataclass(frozen=True)
 class FieldSubject(RenderedSubject):
-    """A radiance field with its renderer; the only subject whose images have derivatives by psi.
+    """A radiance field with its renderer; the only subject whose images have derivatives with respect to psi.
 
     Args:
         name: name of the object.
@@ -277,7 +277,7 @@ class FieldSubject(RenderedSubject):
     def _maps_with_tangents(
         self, camera: PinholeCamera, draw: SceneDraw, names: tuple[str, ...]
     ) -> tuple[Maps, dict[str, Maps]]:
-        """Render the maps, and their derivatives by the named numbers of the draw and by the weight of every light."""
+        """Render the maps, and their derivatives with respect to the draw's named numbers and all weights of lights."""
         poses = orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius).to(self.device, self.dtype)
         rates = pose_rates(draw, names).to(poses) if names else poses.new_zeros(0, *poses.shape)
         lights = 0 if draw.weights is None else draw.weights.shape[1]
