@@ -85,7 +85,12 @@ def test_any_number_of_images_and_the_class_names_in_the_file(plain):
 
 
 @pytest.mark.parametrize(
-    ("kind", "limit", "candidates"), [(RetinaNet, 8, 1000), (RetinaNet, 100, 6), (Fcos, 8, 1000)]
+    ("kind", "limit", "candidates"),
+    [
+        pytest.param(RetinaNet, 8, 1000, marks=pytest.mark.slow),
+        pytest.param(RetinaNet, 100, 6, marks=pytest.mark.slow),
+        (Fcos, 8, 1000),
+    ],
 )
 def test_with_the_suppression_inside_it_gives_what_predict_gives(kind, limit, candidates, tmp_path):
     """Once the limit of an image cuts, once the candidates of a level do; the threshold and the overlap always."""

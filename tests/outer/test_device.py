@@ -58,13 +58,23 @@ def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
     return SimulatorModule(inner, psi, estimator, solver, generator)
 
 
-ESTIMATORS = [
-    PathwiseEstimator(), StratifiedEstimator(probes_per_bin=1), ReinforceEstimator(),
-    pytest.param(PathwiseEstimator("reverse"), marks=pytest.mark.slow),
-]  # fmt: skip
+def _estimators(fast: int):
+    """Parametrize a test by all estimators; all but one of them are slow tests."""
+    of = [
+        StratifiedEstimator(probes_per_bin=1),
+        PathwiseEstimator(),
+        ReinforceEstimator(),
+        PathwiseEstimator("reverse"),
+    ]
+    marks = [() if number == fast else pytest.mark.slow for number in range(len(of))]
+    names = [type(one).__name__ + getattr(one, "mode", "") for one in of]
+    return pytest.mark.parametrize(
+        "estimator",
+        [pytest.param(one, marks=mark, id=name) for one, mark, name in zip(of, marks, names, strict=True)],
+    )
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
+@_estimators(fast=1)
 def test_the_loop_is_the_cpus(scene, pretend, monkeypatch, estimator):
     monkeypatch.setattr(devices, "CACHES", 1)  # sums in the CPU's pieces have its rounding
     found = []
@@ -79,7 +89,7 @@ def test_the_loop_is_the_cpus(scene, pretend, monkeypatch, estimator):
     assert losses[1] == pytest.approx(losses[0], rel=1e-5)
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
+@_estimators(fast=0)
 def test_the_loop_on_the_trainings_derivative_is_the_cpus(scene, pretend, monkeypatch, estimator):
     monkeypatch.setattr(devices, "CACHES", 1)
     found = []
