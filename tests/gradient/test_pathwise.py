@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from neural_sim.gradient.pathwise import (
     map_cotangents,
     psi_contributions,
 )
+from neural_sim.gradient.significance import DRAWS
 from neural_sim.synthesis.motion import moved_by
 from neural_sim.types import Maps
 
@@ -112,6 +114,34 @@ def test_standard_error_is_that_of_a_sum():
     torch.testing.assert_close(derivative.standard_error[0], rows[:, 0].var().mul(4).sqrt())
     assert derivative.standard_error[1] == 0.0
     assert from_contributions(rows[:1]).standard_error.tolist() == [torch.inf, torch.inf]
+
+
+def test_the_p_value_is_that_of_contributions_without_what_all_components_share(problem, pathwise, generator):
+    """All 2^7 changes of sign of contributions that autograd finds; psi's sum turns all cameras, which moves no p."""
+    plain, start, p_values = problem.relaxed, problem.psi, []
+    problem.relaxed = lambda psi: dataclasses.replace(
+        draw := plain(psi), phi=draw.phi + 0.5 * (psi - start).sum()
+    )
+    batch, params = problem.object_images(), problem.minimiser(start)
+    signs = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=7)), dtype=DOUBLE)
+    for _ in range(4):
+        vector = {
+            name: torch.randn(value.shape, generator=generator, dtype=DOUBLE)
+            for name, value in params.items()
+        }
+
+        def scores(psi, vector=vector):
+            images = problem.images(psi)
+            return torch.func.jvp(lambda p: problem.loss_of(p, images, batch.index), (params,), (vector,))[1]
+
+        rows = torch.autograd.functional.jacobian(scores, start)
+        rows = rows - rows.mean(1, keepdim=True)
+        every, own = ((sums.square() / rows.square().sum(0)).sum(-1) for sums in (signs @ rows, rows.sum(0)))
+        exact = float((every >= own * (1.0 - 1e-9)).double().mean())
+        found = pathwise(problem.loss_of, params, vector, batch).p_values["pose"]
+        assert abs(found - exact) < 4 * (exact * (1.0 - exact) / DRAWS) ** 0.5 + 1 / DRAWS
+        p_values.append(exact)
+    assert min(p_values) < 0.05
 
 
 def test_images_without_a_path_are_refused(problem, pathwise):

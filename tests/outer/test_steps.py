@@ -1,6 +1,7 @@
 """Trust-region steps: where they go, what evidence moves them, and what a training's outcome does to them."""
 
 import math
+from dataclasses import replace
 from statistics import NormalDist
 
 import pytest
@@ -9,10 +10,11 @@ import torch
 from neural_sim.gradient.hypergradient import Hypergradient, UnrolledAdjoint
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.outer.certificate import Trust, certify
-from neural_sim.outer.steps import LearnedObjects
+from neural_sim.outer.steps import FreeSteps, LearnedObjects
 from neural_sim.outer.trust_region import TrustRegion
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.update import SGD
 
 POSE = BinnedFactor("pose", "phi", 4, 0.0, 2 * math.pi)
 NAMES = ("a", "b")
@@ -48,6 +50,20 @@ def gradients(target, psi):
     scores = torch.zeros_like(above)
     scores[range(len(above)), target] = 1.0
     return -above * (scores - (above * scores).sum(-1, keepdim=True) / above.sum(-1, keepdim=True))
+
+
+def test_free_steps_shorten_evenly_down_to_the_final_one():
+    """Five gradients that are the same, without momentum: each step has its length from its place alone."""
+    psi, settings = torch.zeros(2, 4, dtype=torch.float64), FreeSteps(SGD(0.1, momentum=0.0), final_step=0.2)
+    steps = settings.begin(LearnedObjects(NAMES, (0, 1), SceneDistribution((POSE,))), psi, iterations=5)
+    gradient = gradients([1, 2], psi)
+    result, lengths = hypergradient(gradient, torch.zeros_like(gradient)), []
+    for _ in range(5):
+        before, (steps, p_values) = steps.reported, steps.observe(result)
+        certificate = certify(result, p_values, NAMES, ("pose",), Trust(None), Unrolled())
+        steps = steps.propose(certificate, 1.0)
+        lengths.append(float((steps.reported - before).norm() / (0.1 * gradient.norm())))
+    assert lengths == pytest.approx([1.0, 0.8, 0.6, 0.4, 0.2])
 
 
 def variation(factor, a, b):
@@ -123,6 +139,19 @@ def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
     steps, _ = steps.judge(scored(0.5, 0.5, 0.5), scored(0.6, 0.4, 0.5))
     assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
     assert steps.radius["zoom"].tolist() == [0.5, 0.5]
+
+
+@pytest.mark.parametrize(("part", "moving"), [(0.0, 1), (0.8, 2)])
+def test_the_most_significant_factor_counts_as_one_of_those_that_move(part, moving):
+    """Bonferroni: its p-value times their number, of two factors of which the second moves or does not."""
+    zoom, psi = BinnedFactor("zoom", "distance", 4, 1.0, 2.0), torch.zeros(2, 8, dtype=torch.float64)
+    gradient = torch.cat([gradients([1, 2], psi[:, :4]), part * gradients([2, 1], psi[:, :4])], 1)
+    steps, p_values = proposed(
+        steps_at(psi, (POSE, zoom)), gradient, torch.full_like(gradient, 0.1), level=0.9
+    )
+    assert [int(moved.sum()) for moved in steps.moved.values()] == [2, 2 * (moving - 1)]
+    expected = [-NormalDist().inv_cdf(moving * min(p_values[name].values())) for name in NAMES]
+    assert steps.significance.tolist() == pytest.approx(expected, rel=1e-9)
 
 
 def scattering(images=50):
@@ -209,6 +238,16 @@ def test_what_others_lose_counts_beyond_the_error_of_the_sum():
             torch.zeros(2, 50), torch.stack([torch.full_like(others, 0.1 / 50), others])
         )
         assert verdicts["a"].accepted == kept
+
+
+@pytest.mark.parametrize(("fall", "kept"), [(0.17, True), (0.18, False)])
+def test_trainings_scatter_in_every_class_adds_to_the_error_of_the_sum(fall, kept):
+    """Between trainings each of the three classes scatters by 0.1, and their sum by 0.1 sqrt(3) = 0.173."""
+    gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
+    steps = replace(steps_at(torch.zeros(2, 4, dtype=torch.float64)), at_rest=(0.01,))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    _, verdicts = steps.judge(scored(0.0, 0.0, 0.0), scored(0.5, 0.5, -1.0 - fall))
+    assert [verdict.accepted for verdict in verdicts.values()] == [kept, kept]
 
 
 def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():

@@ -74,6 +74,8 @@ def test_a_loss_that_shows_over_several_trainings_is_taken_back_object_by_object
 def test_a_settled_object_cannot_go_back():
     way = walked({"a": [(0.5, 0.52, 0.51), (0.45, 0.46)], "b": [(0.5, 0.52), (0.3, 0.29)]})
     assert set(way.best()) == {"a", "b"} and set(way.settled(["a"]).best()) == {"b"}
+    (here,) = way.settled(["a"]).stays["a"]
+    assert float(here.psi) == 1.0 and here.scores == (0.45, 0.46)
 
 
 def test_the_last_psi_is_kept_where_it_is_as_good_or_scores_are_unknown():

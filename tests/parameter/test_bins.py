@@ -106,6 +106,13 @@ def test_floor_out_of_range_is_refused():
         binned.log_probabilities(torch.zeros(4), 0.25)
 
 
+def test_the_bin_of_an_angle_is_that_of_its_direction():
+    angle = torch.linspace(0.01, 2.0 * math.pi - 0.01, 50, dtype=torch.float64)
+    wanted = (angle // (math.pi / 4)).long()
+    for turns in (-2, -1, 0, 1, 3):
+        assert torch.equal(binned.nearest_bin(angle + 2.0 * math.pi * turns, 8, 0.0, 2.0 * math.pi), wanted)
+
+
 def test_linear_mean_of_opposite_wrap_bins_lands_on_the_far_side():
     centre = binned.centres(8, 0.0, 2 * math.pi, torch.zeros(1, dtype=torch.float64))
     y = torch.zeros(8, dtype=torch.float64)

@@ -123,6 +123,18 @@ def test_mirror_step_shrinks_components_within_their_noise():
     assert 0.45 < drift[True] / drift[False] < 0.7
 
 
+def test_the_noise_of_a_momentum_is_that_of_the_weighted_sum_of_gradients():
+    """After n gradients of the same error, the weights are (1 - m) m^j: their squares are a geometric series."""
+    update, psi = Mirror(momentum=0.6), torch.zeros(1, 3, dtype=torch.float64)
+    log_p = torch.tensor([[0.5, 0.3, 0.2]], dtype=torch.float64).log()
+    gradient, error = torch.tensor([[0.2, -0.3, 0.1], [0.02, 0.01, 0.03]], dtype=torch.float64)[:, None]
+    state = UpdateState.zeros(psi)
+    for taken in range(1, 5):
+        _, state = update.step(psi, log_p, gradient, error, state)
+        weights = 0.4 * 0.6 ** torch.arange(taken, dtype=torch.float64)
+        torch.testing.assert_close(state.noise, weights.square().sum() * (error / log_p.exp()).square())
+
+
 def test_mirror_goes_on_after_a_cliff():
     """One gradient of 1e12 among ordinary ones costs steps of a tenth, not all that follow."""
     update, psi = Mirror(learning_rate=0.3, momentum=0.5), torch.zeros(1, 4, dtype=torch.float64)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.solver.base import Status
+from neural_sim.solver.base import Iterate, LinearSolver, Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping, lanczos, random_start
 from neural_sim.solver.direct import Exact
@@ -167,6 +167,20 @@ def test_lanczos_damping_bounds_the_condition_number(low, generator):
     assert choice.value >= 1.25 * max(0.0, -low) * (1 - 1e-9)
 
 
+@pytest.mark.parametrize("steps", [2, 4, 6])
+def test_damping_allows_for_the_error_of_the_smallest_ritz_value(steps, generator):
+    """Ritz pairs of a dense basis of the Krylov space, and the norms of their residuals."""
+    matrix, b = torch.diag(torch.linspace(-5.0, 10.0, 30, dtype=DOUBLE)), torch.ones(30, dtype=DOUBLE)
+    powers = torch.stack([torch.linalg.matrix_power(matrix / 10.0, power) @ b for power in range(steps)], 1)
+    basis, _ = torch.linalg.qr(powers)
+    values, inside = torch.linalg.eigh(basis.T @ matrix @ basis)
+    vectors = basis @ inside
+    least = float(values[0] - (matrix @ vectors[:, 0] - values[0] * vectors[:, 0]).norm())
+    wanted = max(-1.25 * least, (float(values[-1]) - 50.0 * least) / 49.0)
+    choice = LanczosDamping(max_condition=50.0, lanczos_steps=steps).choose(matrix.mv, b, generator)
+    assert choice.value == pytest.approx(wanted, rel=1e-8)
+
+
 def test_damping_of_a_non_finite_operator_is_its_minimum(generator):
     choice = LanczosDamping(minimum=0.125).choose(
         lambda v: v * math.nan, torch.ones(3, dtype=DOUBLE), generator
@@ -229,6 +243,28 @@ def test_damping_is_raised_until_conjugate_gradients_hold(generator):
         and fixed.damping_raises == 0
         and fixed.damping.value == 0.1
     )
+
+
+@dataclass(frozen=True)
+class Looking(LinearSolver):
+    """Looks along the first axis alone, and says whether its curvature is negative."""
+
+    def iterate(self, system):
+        product = system.operator.measured(torch.eye(len(system.rhs), dtype=DOUBLE)[0])
+        status = Status.NEGATIVE_CURVATURE if product.energy < 0.0 else Status.MAX_STEPS
+        return Iterate(torch.zeros_like(system.rhs), status, 1)
+
+
+def test_damping_is_raised_by_the_curvature_of_the_loss_without_damping(generator):
+    """The right-hand side has no part along the eigenvalue -2, so lambda starts at (3 - 2 * 1) / (2 - 1) = 1.
+
+    Along it, the damped curvature is -1 and the loss's is -2: (3 + 2 * 2) / (2 - 1) = 7 bounds the condition by 2.
+    """
+    values, b = torch.tensor([-2.0, 1.0, 3.0], dtype=DOUBLE), torch.tensor([0.0, 1.0, 1.0], dtype=DOUBLE)
+    solver = AdjointSolver(Looking(), LanczosDamping(max_condition=2.0))
+    terms, params = [lambda p: 0.5 * values @ p["w"].square()], {"w": torch.zeros(3, dtype=DOUBLE)}
+    found = solver.solve(terms, params, b, None, generator)
+    assert found.damping_raises == 1 and found.damping.value == pytest.approx(7.0)
 
 
 def test_damping_of_a_zero_right_hand_side(network, generator):

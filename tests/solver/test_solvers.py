@@ -35,6 +35,16 @@ def test_conjugate_gradients_name_the_negative_curvature_seen():
     assert solution.value.norm() == 0.0 and solution.residual == 1.0
 
 
+@pytest.mark.parametrize(
+    ("energy", "status"), [(1e-17, Status.NEGATIVE_CURVATURE), (1e-14, Status.MAX_STEPS)]
+)
+def test_conjugate_gradients_take_no_step_along_curvature_below_rounding(energy, status):
+    """Along b, the product is orthogonal to b but for ``energy``, less or more than the machine epsilon 2e-16."""
+    matrix = torch.tensor([[energy, 1.0], [1.0, 0.0]], dtype=DOUBLE)
+    b = torch.tensor([1.0, 0.0], dtype=DOUBLE)
+    assert ConjugateGradient().solve(matrix.mv, b, max_steps=1).status is status
+
+
 def test_minres_matches_scipy_step_by_step(symmetric, right_hand_side, spread):
     eigenvalues = torch.cat([spread(1e3, 12), -spread(1e2, 12)])
     matrix, b = symmetric(eigenvalues), right_hand_side()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
-from scipy.stats import beta
+from scipy.stats import beta, binom
 
 from neural_sim.baseline.label_shift.mixture import (
     Cells,
@@ -140,6 +140,22 @@ def test_the_test_of_one_factor_leaves_the_others_free():
     even = torch.tensor([0.5, 0.5], dtype=torch.float64)
     assert ratio_test(boxes, cells, {0: even}, known, 0.3, 99, seed) > 0.3
     assert ratio_test(boxes, cells, {1: even}, known, 0.3, 99, seed) == pytest.approx(0.01)
+
+
+def test_known_boxes_stand_for_the_null_however_many_of_them_each_cell_has():
+    """Sure boxes of two bins make it a binomial test of 15 in 20; nine in ten known boxes are of the first bin.
+
+    Rounding decides whether a draw of the same counts is a tie, so the p-value lies between the two exact tails.
+    """
+    sure, known = torch.eye(2, dtype=torch.float64), torch.tensor([0] * 90 + [1] * 10)
+    even, draws = torch.tensor([0.5, 0.5], dtype=torch.float64), 999
+    found = ratio_test(
+        sure[[0] * 15 + [1] * 5], Cells((2,)), {0: even}, (sure[known], known), 0.3, draws,
+        torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    beyond, at_least = (2 * binom.sf(count, 20, 0.5) for count in (15, 14))
+    error = 4 * math.sqrt(at_least / draws)
+    assert beyond - error < found < at_least + error + 1 / draws
 
 
 def test_the_log_likelihood_is_that_of_every_box():

@@ -58,6 +58,15 @@ def test_the_scatter_of_guesses_is_not_averaged_out_by_boxes():
     torch.testing.assert_close(response.covariance(10**6, even), response.scatter, atol=1e-4, rtol=0.0)
 
 
+def test_images_of_one_render_say_as_much_of_the_slope_as_one_of_them():
+    """The error of B rests on the different lights: five images under each make it no smaller."""
+    guesses, weights = renders(40, 0.1)
+    expected = torch.linalg.inv(weights.T @ weights)
+    for images in (1, 5):
+        repeated = (values.repeat_interleave(images, 0) for values in (guesses, weights))
+        torch.testing.assert_close(Response.of(*repeated).precision, expected, rtol=1e-5, atol=0.0)
+
+
 def test_a_ridge_guesses_weights_that_are_linear_in_what_is_seen():
     seen, weights = renders(300, 0.0)
     torch.testing.assert_close(fitted(seen, weights, seen[:5], ridge=1e-9), weights[:5], atol=1e-4, rtol=0.0)
