@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d
 
 from neural_sim.baseline.label_shift import reading
 from neural_sim.baseline.label_shift.crops import Augmentation
-from neural_sim.baseline.label_shift.estimate import LabelShift, estimate
+from neural_sim.baseline.label_shift.estimate import LabelShift, estimate, trained_reader
 from neural_sim.baseline.label_shift.mixture import Status
 from neural_sim.baseline.label_shift.network import Fitting
 from neural_sim.parameter.distributions import total_variation
@@ -153,6 +153,28 @@ def test_exposure_and_a_little_blur_do_not_matter(posed, found):
     assert float(total_variation(torch.tensor(lamp.p), torch.tensor(found.factors[0].p))) < 0.1
 
 
+def test_overexposed_and_blurred_images_move_nothing(posed):
+    """Three stops brighter, with little detail left: beyond what the crops of renders are changed by."""
+    scene, target, psi = posed
+    images = avg_pool2d((8.0 * target.images).clamp(0.0, 1.0), 9, 1, 4, count_include_pad=False)
+    result = read(scene, replace(target, images=images), psi)
+    assert {one.finding for one in result.factors} == {"fits no render"}
+    torch.testing.assert_close(result.psi, psi.double())
+
+
+def test_an_object_whose_field_is_bad_moves_nothing_and_the_other_is_read(posed):
+    """A field of wrong poses: its patch is on the other side, in fog. It says with certainty what is wrong."""
+    scene, target, psi = posed
+    lamp, cup = scene.subjects
+    fog = avg_pool2d(lamp.maps.flip(2).movedim(-1, 1).float(), 7, 1, 3).movedim(1, -1)
+    bad = replace(scene, subjects=(replace(lamp, maps=fog.round().to(torch.uint8)), cup))
+    result = read(bad, target, psi)
+    lamp, cup = result.factors
+    assert lamp.accuracy > 0.8 and float(total_variation(torch.tensor(lamp.p), torch.tensor(P))) > 0.5
+    assert lamp.finding == "fits no render" and cup.finding == "stays"
+    torch.testing.assert_close(result.psi, psi.double())
+
+
 def test_renders_that_are_not_told_apart_move_nothing(posed):
     """An object that looks the same from everywhere: its classifier is at chance, and says so."""
     scene, target, psi = posed
@@ -266,6 +288,16 @@ def test_distances_are_read_off_the_size_of_boxes_where_few_renders_say_little_e
     assert min(lamp.accuracy, cup.accuracy) > 0.9
     assert lamp.finding == "moves" and float(total_variation(torch.tensor(lamp.p), torch.tensor(P))) < 0.1
     assert cup.finding == "stays"
+
+
+def test_posteriors_are_those_that_the_estimate_is_made_of(posed, found):
+    scene, target, psi = posed
+    reader = trained_reader(scene, target, SETTINGS, torch.Generator().manual_seed(0))
+    seen, held, cells = reader.posteriors(0, psi[0])
+    assert float((held.argmax(-1) == cells).double().mean()) == found.factors[0].accuracy
+    told = torch.bincount(seen.argmax(-1), minlength=4) / len(seen)
+    assert len(seen) == found.factors[0].boxes
+    assert float(total_variation(told, torch.tensor(P))) < 0.1
 
 
 def test_augmented_crops_keep_their_shape_and_differ(posed):

@@ -59,11 +59,14 @@ class Estimate:
 
 
 @dataclass
-class _Clock:
+class Clock:
+    """Processor seconds by phase."""
+
     spent: dict[str, float] = field(default_factory=dict)
     last: float = field(default_factory=time.process_time)
 
     def __call__(self, what: str) -> None:
+        """End the phase ``what``."""
         now = time.process_time()
         self.spent[what], self.last = self.spent.get(what, 0.0) + now - self.last, now
 
@@ -88,7 +91,27 @@ def estimate(
         groups: bins that look the same; None: every bin looks different.
         whole: read whole images instead of boxes, for ``task=classification``.
     """
-    clock, begun = _Clock(), time.perf_counter()
+    clock, begun = Clock(), time.perf_counter()
+    reader = trained_reader(scene, validation, settings, generator, whole, clock)
+    found, moved = [], psi.detach().cpu().double().clone()
+    for label, name in enumerate(scene.names):
+        own, moved[label] = reader.read(label, name, moved[label], (groups or {}).get(name, {}))
+        found += own
+    clock("evidence")
+    images, seconds = len(reader.training.crops) + len(reader.held.crops), time.perf_counter() - begun
+    return Estimate(tuple(found), moved, images, seconds, clock.spent)
+
+
+def trained_reader(
+    scene: Scene,
+    validation: LabelledImages,
+    settings: LabelShift,
+    generator: torch.Generator,
+    whole: bool = False,
+    clock: Clock | None = None,
+) -> Reader:
+    """Train the classifier on renders; return the reader of the boxes of ``validation``. See ``estimate``."""
+    clock = clock or Clock()
     pool = pool_for(scene, settings.per_bin, generator)
     clock("pool")
     sides = parted(with_bank(pool, settings.backgrounds, generator), settings.held_out)
@@ -103,11 +126,4 @@ def estimate(
     settings.fitting(training, network, augmentation, generator)
     clock("network")
     target = crops_of(validation.to("cpu"), whole)
-    reader = Reader(settings, distribution, network, training, held, target, generator)
-    found, moved = [], psi.detach().cpu().double().clone()
-    for label, name in enumerate(scene.names):
-        own, moved[label] = reader.read(label, name, moved[label], (groups or {}).get(name, {}))
-        found += own
-    clock("evidence")
-    images, seconds = len(training.crops) + len(held.crops), time.perf_counter() - begun
-    return Estimate(tuple(found), moved, images, seconds, clock.spent)
+    return Reader(settings, distribution, network, training, held, target, generator)

@@ -63,6 +63,24 @@ class Reader:
         self, label: int, name: str, psi: Float[Tensor, "K"], groups: Mapping[str, Bins]
     ) -> tuple[list[FactorEstimate], Float[Tensor, "K"]]:
         """Return the estimates of an object's factors, and its psi with the factors that move replaced."""
+        object_ = self._object(label, name, psi, groups)
+        found, new = object_.found(), dict(object_.psi)
+        for one in found:
+            if one.finding in MOVING:
+                factor = self.distribution.factor(one.factor)
+                new[one.factor] = factor.project(
+                    factor.psi_of(torch.tensor(one.p, dtype=torch.float64), factor.closed(name))
+                )
+        return found, self.distribution.join(new)
+
+    def posteriors(
+        self, label: int, psi: Float[Tensor, "K"]
+    ) -> tuple[Float[Tensor, "boxes cells"], Float[Tensor, "held cells"], Int[Tensor, "held"]]:
+        """Return calibrated posteriors of an object's boxes and held-out renders, and the true cells of the latter."""
+        object_ = self._object(label, "", psi, {})
+        return *object_.posteriors, object_.held.cells
+
+    def _object(self, label: int, name: str, psi: Float[Tensor, "K"], groups: Mapping[str, Bins]) -> _Object:
         now = self.distribution.split(psi)
         drawn = _drawn(self.distribution, now)
         training, held = (
@@ -75,15 +93,7 @@ class Reader:
         if len(training.crops) and len(held.crops):
             features = outputs_of(self.network, training.crops).features
             limits = Strangeness.of(features, training.cells, training.weights.double())
-        object_ = _Object(self, name, now, groups, held, known, seen, limits)
-        found, new = object_.found(), dict(object_.psi)
-        for one in found:
-            if one.finding in MOVING:
-                factor = self.distribution.factor(one.factor)
-                new[one.factor] = factor.project(
-                    factor.psi_of(torch.tensor(one.p, dtype=torch.float64), factor.closed(name))
-                )
-        return found, self.distribution.join(new)
+        return _Object(self, name, now, groups, held, known, seen, limits)
 
     def _guessed(self, training: Known, crops: Crops, drawn: Bool[Tensor, "cells"]) -> Outputs:
         """Return the network's outputs, with logits from boxes alone and weights of lights from colours alone added."""
@@ -127,6 +137,12 @@ class _Object:
     known: Outputs
     seen: Outputs
     limits: Strangeness | None
+
+    @property
+    def posteriors(self) -> tuple[Float[Tensor, "boxes cells"], Float[Tensor, "held cells"]]:
+        """Calibrated posteriors of the boxes and of the held-out renders."""
+        calibrated = calibrate(self.known.logits, self.held.cells)
+        return calibrated(self.seen.logits)[0], calibrated(self.known.logits)[0]
 
     def found(self) -> list[FactorEstimate]:
         """Estimate the factors, in their order."""
@@ -193,10 +209,7 @@ class _Object:
         ]
         within = [_within(p, own) for p, own in zip(p_now, groups, strict=True)]
         cells = Cells(tuple(len(own) for own in groups))
-        calibrated = calibrate(self.known.logits, self.held.cells)
-        seen, held = (
-            grouped(calibrated(outputs.logits)[0], every, within) for outputs in (self.seen, self.known)
-        )
+        seen, held = (grouped(each, every, within) for each in self.posteriors)
         bins = zip(groups, every.sizes, every.bins(self.held.cells), strict=True)
         truth = cells.index(torch.stack([_group_of(own, size)[b] for own, size, b in bins], 1))
         best = maximise(seen, cells, settings.prior)
