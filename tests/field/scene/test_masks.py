@@ -2,6 +2,8 @@
 
 import logging
 import re
+from argparse import Namespace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -106,7 +108,6 @@ def test_pinholes_are_filled_and_other_holes_are_not():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_seed_gives_the_same_masks(made):
     few = SceneMasks(image_size=48, resolution=48, steps=40, batch_rays=1024)
     box = [[0.15, -0.35, 0.95], [0.45, -0.1, 1.25]]
@@ -117,3 +118,16 @@ def test_a_seed_gives_the_same_masks(made):
     other = SceneMasks(image_size=48, resolution=48, steps=40, batch_rays=1024, seed=1)
     masks = Photos(made.folder.parent, masks="scene", scene=other, box=box).computed_masks("mug")
     assert not all(torch.equal(a, b) for a, b in zip(runs[0], masks, strict=True))
+
+
+@pytest.mark.slow
+def test_masks_of_the_benchmarks_can_are_as_good_as_reported(monkeypatch):
+    """docs/results.md has 0.900 and 24.4 dB, 1.6 less than from the true masks."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[3] / "benchmarks")
+    from scene_masks import measure
+
+    options = Namespace(photos=40, size=(200, 150), noise=0.0)
+    row = measure(Procedural(["can"]).load()[0], options)
+    print(row)
+    assert row["overlap"] > 0.88
+    assert row["psnr"] > row["psnr_true_masks"] - 2.5
