@@ -11,10 +11,16 @@ from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import train_detector
 from neural_sim.main import build, context_of
+from neural_sim.outer.records import Cost
 from neural_sim.randomness import stream
+from neural_sim.stages import detector as detector_stages
+from neural_sim.stages.detector import DetectorStage, TrainedDetector
 from neural_sim.stages.graph import Graph
+from neural_sim.stages.scene import LoadedImages
+from neural_sim.stages.target_sets import TargetSets, TargetSetsStage
 from neural_sim.target.rendered import RenderedTarget
 from neural_sim.tasks.walk import walk
+from neural_sim.types import LabelledImages
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",
@@ -184,3 +190,39 @@ def test_fine_tuning_goes_on_from_the_detector_of_synthetic_images(folder):
         detector, before.params, photographs, generator, how, sampling=Sampling((6,), (6,), 5)
     )
     assert all(torch.equal(value, params[name]) for name, value in after.params.items())
+
+
+class Clock:
+    """Time that only passes while an input is made."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+    process_time = perf_counter
+
+
+@pytest.mark.parametrize("mode", ["combined", "pretrain"])
+def test_the_cost_of_a_training_excludes_making_its_inputs(mode, monkeypatch):
+    """And an input that is a training itself is charged once."""
+    monkeypatch.setattr(detector_stages, "time", clock := Clock())
+    graph = graph_of(f"training.real.mode={mode}")
+    size, zeros = (graph.camera.height, graph.camera.width), torch.zeros(6, dtype=torch.long)
+    boxes = torch.tensor([2.0, 2.0, 20.0, 20.0]).expand(6, 1, 4)
+    few = LabelledImages(torch.rand(6, 3, *size), boxes, zeros[:, None], zeros)
+    stage = graph.trained_on(graph.psi("initial"), "initial")
+    params, ready = stage.build().init(torch.Generator()), set()
+
+    def made(wanted):
+        clock.now += 0.0 if wanted.entry in ready else 1000.0
+        ready.add(wanted.entry)
+        if isinstance(wanted, TargetSetsStage):
+            return TargetSets(few, few, few)
+        is_training = isinstance(wanted, DetectorStage)
+        return TrainedDetector(params, Cost(7, 8, 9, 5.0, 5.0)) if is_training else LoadedImages(few)
+
+    cost = stage.make(made).cost
+    spent = 5.0 if mode == "pretrain" else 0.0
+    assert (cost.seconds, cost.cpu_seconds) == (spent, spent) and clock.now == 2000.0

@@ -2,6 +2,8 @@
 
 import importlib.metadata
 import json
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -95,6 +97,31 @@ def test_packages_that_are_missing_or_too_old_are_bad(monkeypatch):
 def test_little_memory_is_a_note(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor, "_free_memory_gb", lambda: 1.5)
     assert findings(tmp_path)["memory", "note"]["found"] == "1.5 GB free"
+
+
+def test_cached_files_of_a_container_count_as_free(tmp_path):
+    """Of a limit of 8 GiB, 7 are in use, 5 of them for files that were read."""
+    gib = 2**30
+    group = tmp_path / "sys/fs/cgroup"
+    group.mkdir(parents=True)
+    (tmp_path / "proc").mkdir()
+    (tmp_path / "proc/meminfo").write_text(f"MemTotal: {64 * 2**20} kB\nMemAvailable: {32 * 2**20} kB\n")
+    assert doctor._free_memory_gb(tmp_path) == 32.0
+    (group / "memory.max").write_text(f"{8 * gib}\n")
+    (group / "memory.current").write_text(f"{7 * gib}\n")
+    (group / "memory.stat").write_text(f"anon {2 * gib}\ninactive_file {5 * gib}\n")
+    assert doctor._free_memory_gb(tmp_path) == 6.0
+    (group / "memory.max").write_text("max\n")
+    assert doctor._free_memory_gb(tmp_path) == 32.0
+
+
+def test_every_folder_that_an_experiment_reads_is_known(tmp_path):
+    texts = [path.read_text() for path in Path("conf").rglob("*.yaml")]
+    read = {name for text in texts for name in re.findall(r"\$\{paths\.data\}/(\w+)", text)}
+    assert read
+    for name in read:
+        (tmp_path / name).mkdir()
+    assert sorted(next(doctor.data(tmp_path)).found.partition(": ")[2].split(", ")) == sorted(read)
 
 
 def test_a_check_that_fails_is_what_was_to_be_found(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from composing import composed
+from filelock import FileLock
 from PIL import Image
 
 from neural_sim.cameras import reframed
@@ -179,6 +180,23 @@ def test_bad_settings_are_one_line_and_leave_nothing(overrides, message, base, t
         export(base, tmp_path / "run", *given)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("overrides", "message"), [REFUSED[6], REFUSED[-1]])
+def test_bad_settings_are_refused_before_the_tasks_that_come_first(overrides, message, base, tmp_path):
+    given = [f"paths.store={tmp_path / 'store'}", "stages=[views,export]", *overrides]
+    with pytest.raises(ValueError, match=message):
+        export(base, tmp_path / "run", *given)
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_folder_that_cannot_be_locked_is_named_by_its_own_key(made, base, tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(FileLock, "acquire", refuse)
+    with pytest.raises(ValueError, match=r"^export\.folder: .* cannot be written: Permission denied$"):
+        export(base, tmp_path / "run", f"export.folder={tmp_path / 'data'}")
 
 
 def test_another_configuration_of_a_folder_is_refused_before_fields_are_fitted(

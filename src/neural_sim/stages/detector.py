@@ -131,7 +131,8 @@ class DetectorStage(TrainedStage):
 
     @override
     def make(self, results: Results) -> TrainedDetector:
-        results(self.scene)  # made before the clock starts, so that the cost excludes the fields
+        # Made before the clock starts, so that the cost excludes the fields and the target sets.
+        _, photographs = results(self.scene), self.photographs(results)
         detector, training, generator = self.build(), self.training, self.generator()
         begun, cpu_begun = time.perf_counter(), time.process_time()
         images, sampling = self.images(results, generator).images.to(self.device), None
@@ -141,7 +142,7 @@ class DetectorStage(TrainedStage):
                 "unlearned), larger images (training.image_size), or a smaller synthesis.minimum_area",
                 self.title, ", ".join(unseen),
             )  # fmt: skip
-        drawn, photographs = len(images), self.photographs(results)
+        drawn = len(images)
         if photographs is not None:
             images = LabelledImages.concatenate([images, photographs.to(self.device)])
             sampling = training.real.sampling(drawn, len(photographs), training.batch_size)
@@ -206,22 +207,19 @@ class PhotographsStage(TrainedStage):
         detector, training = self.build(), self.training
         generator = stream(self.seed, "fine-tuning")
         photographs = training.real.chosen(results(self.targets).train, self.seed).to(self.device)
+        start = None if self.start is None else results(self.start)  # its cost is added below
         begun, cpu_begun = time.perf_counter(), time.process_time()
-        start = (
-            placed(detector.init(generator), self.device)
-            if self.start is None
-            else results(self.start).params
-        )
+        initial = placed(detector.init(generator), self.device) if start is None else start.params
         how = training.of(self.epochs)
-        if self.start is not None:
+        if start is not None:
             how = replace(how, learning_rate=training.real.finetune_learning_rate)
         count = len(photographs)
         sampling = Sampling((count,), (min(training.batch_size, count),), self.steps)
-        params, history = train_detector(detector, start, photographs, generator, how, sampling=sampling)
+        params, history = train_detector(detector, initial, photographs, generator, how, sampling=sampling)
         synchronise(self.device)
         cost = Cost(
             detector_steps=history.steps,
             seconds=time.perf_counter() - begun,
             cpu_seconds=time.process_time() - cpu_begun,
         )
-        return TrainedDetector(params, cost if self.start is None else cost + results(self.start).cost)
+        return TrainedDetector(params, cost if start is None else cost + start.cost)

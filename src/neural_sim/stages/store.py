@@ -174,18 +174,19 @@ class _Damage(Exception):
 
 
 @contextmanager
-def locked(path: Path, wait: bool = True) -> Iterator[bool]:
+def locked(path: Path, wait: bool = True, key: str = "paths.store") -> Iterator[bool]:
     """Lock an entry. The operating system frees the lock when its process ends, however it ends.
 
-    Yields whether this process got the lock, which is certain only with ``wait``.
+    Yields whether this process got the lock, which is certain only with ``wait``. Messages name ``key``, the setting
+    that ``path`` comes from.
     """
     lock = _lock(path)
-    with _writing(path):
+    with _writing(path, key):
         try:
             lock.acquire(timeout=0)
         except Timeout:
             if wait:
-                _log.info("store: waiting for another run, which is making %s", path)
+                _log.info("%s: waiting for another run, which is making %s", key, path)
                 lock.acquire()
     try:
         yield lock.is_locked
@@ -296,12 +297,12 @@ def _write(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def _writing(path: Path, key: str = "paths.store") -> Iterator[None]:
     """Turn an ``OSError`` from writing a file into a ``ValueError`` that names the file."""
     try:
         yield
     except OSError as error:
-        raise ValueError(f"paths.store: {path} cannot be written: {error.strerror or error}") from error
+        raise ValueError(f"{key}: {path} cannot be written: {error.strerror or error}") from error
 
 
 def to_bytes(images: Tensor) -> Tensor:

@@ -219,7 +219,7 @@ def database(uri: str) -> Iterator[Finding]:
 
 def data(root: Path) -> Iterator[Finding]:
     """Check for the data-set folders that experiments refer to."""
-    known: Sequence[str] = ("ycb", "ycb_video", "ycb_in_the_wild")
+    known: Sequence[str] = ("ycb", "ycb_video_sample", "ycb_in_the_wild", "objectnet", "captures")
     found = [name for name in known if (root / name).is_dir()]
     if found:
         yield Finding("ok", "data", f"{root}: {', '.join(found)}")
@@ -236,16 +236,27 @@ def _is_installed(name: str) -> bool:
     return True
 
 
-def _free_memory_gb() -> float | None:
-    """Return the free memory, taking the limit of a container (cgroup v2) into account."""
+def _free_memory_gb(root: Path = Path("/")) -> float | None:
+    """Return the free memory, taking the limit of a container (cgroup v2) into account.
+
+    The cache of files counts as free, because the kernel gives it up when programs need the memory.
+    """
+    group = root / "sys/fs/cgroup"
     try:
-        rows = (row.split() for row in Path("/proc/meminfo").read_text().splitlines())
-        free = next(float(row[1]) * 1024 for row in rows if row[0] == "MemAvailable:")
+        free = 1024.0 * _number_in(root / "proc/meminfo", "MemAvailable:")
     except (OSError, StopIteration):
         return None
     try:
-        limit = int(Path("/sys/fs/cgroup/memory.max").read_text())
-        free = min(free, limit - int(Path("/sys/fs/cgroup/memory.current").read_text()))
-    except (OSError, ValueError):  # no cgroup, or "max"
+        used = int((group / "memory.current").read_text()) - _number_in(
+            group / "memory.stat", "inactive_file"
+        )
+        free = min(free, int((group / "memory.max").read_text()) - used)
+    except (OSError, ValueError, StopIteration):  # no cgroup, or "max"
         pass
     return free / 2**30
+
+
+def _number_in(file: Path, name: str) -> int:
+    """Return the number after ``name`` in a table of the kernel's."""
+    rows = (row.split() for row in file.read_text().splitlines())
+    return next(int(row[1]) for row in rows if row[0] == name)

@@ -95,15 +95,20 @@ class ExportTask(Task):
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
         graph = context.graph
+        self._check_formats(context)
+        self._workers(context)
         fields = graph.fields if self.detail == "run" else ()
-        return [*fields, graph.learned] if self.psi == "learned" else fields
+        if self.psi == "learned":
+            return [*fields, graph.learned]
+        self._psi(context)  # raises if the distribution is unknown or its file is unfit
+        return fields
 
     @override
     def run(self, context: Context) -> None:
         root = context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser()
         data, distribution = self._data_set(context, root), context.experiment.imaging.distribution
         root.parent.mkdir(parents=True, exist_ok=True)
-        with locked(_lock_of(root)), self._resuming(context, data):
+        with locked(_lock_of(root), key="export.folder"), self._resuming(context, data):
             records = data.write(lambda numbers: context.shown(numbers, "export"))
             rows = psi_rows(distribution, data.source.psi, data.source.scene.names)
             write_whole(root / "psi.csv", psi_csv(rows))
@@ -114,16 +119,19 @@ class ExportTask(Task):
             f"{len(records)} images with {labelled} labelled objects\ndata set: {root}\nwhat is in it? open {page}"
         )
 
-    def _data_set(self, context: Context, root: Path) -> DataSet:
-        x, graph = context.experiment, context.graph
-        distribution, synthesis = x.imaging.distribution, x.imaging.synthesis
-        zooms = any(factor.coordinate == "magnification" for factor in distribution.binned)
-        if "bop" in self.formats and zooms and synthesis.count.most > 1:
+    def _check_formats(self, context: Context) -> None:
+        imaging = context.experiment.imaging
+        zooms = any(factor.coordinate == "magnification" for factor in imaging.distribution.binned)
+        if "bop" in self.formats and zooms and imaging.synthesis.count.most > 1:
             raise ValueError(
                 "export.formats: bop has one camera for all objects of an image, and parameter.zoom.by=focal_length "
                 "gives each its own; want other formats, parameter.zoom.by=distance, or "
                 "synthesis.objects_per_image=[1, 1]"
             )
+
+    def _data_set(self, context: Context, root: Path) -> DataSet:
+        x, graph = context.experiment, context.graph
+        distribution, synthesis = x.imaging.distribution, x.imaging.synthesis
         size = (graph.camera.width, graph.camera.height) if self.width is None else (self.width, self.height)
         camera = reframed(graph.camera, *cast(tuple[int, int], size))
         workers = self._workers(context)
@@ -213,7 +221,7 @@ def _move_unfinished(left: Path, data: DataSet) -> None:
     if not (left / MANIFEST).is_file():
         return
     try:
-        with locked(_lock_of(left), wait=False) as ours:
+        with locked(_lock_of(left), wait=False, key="export.folder") as ours:
             if ours:
                 ExportFolder(left, data.identity).check()
                 shutil.move(left, data.root)
