@@ -46,7 +46,7 @@ def test_a_slower_machine_takes_longer(tmp_path, monkeypatch):
 def test_what_was_never_measured_is_named(tmp_path):
     text = said(tmp_path, "detector=fcos")
     assert "field 90 s" in text and text.endswith(
-        "; without warm_start, psi, evaluate, unknown until a first run"
+        "; not counting warm_start, psi, evaluate, unknown before a first run"
     )
     assert said(tmp_path, "detector=fcos", "stages=[evaluate]", "field=mlp").startswith(": about ")
     assert said(tmp_path, "workers=2") == ""

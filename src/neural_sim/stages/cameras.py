@@ -60,7 +60,7 @@ class CommandMasksStage(_StoredMasks):
     @property
     @override
     def title(self) -> str:
-        return f"masks of {self.object} by a command"
+        return f"masks of {self.object} computed by a command"
 
     @override
     def make(self, results: Results) -> MasksOfFrames:
@@ -141,7 +141,7 @@ def _lens(stored: list[Any]) -> Lens:
 
 @dataclass(frozen=True)
 class MasksStage(_StoredMasks):
-    """Masks computed from the geometry of the scene, one for each photograph of an object that has a camera.
+    """Masks of an object's photographs, computed from the geometry of the scene; those without a camera have none.
 
     They do not depend on the run's seed, so runs with different seeds share them.
 

@@ -68,7 +68,8 @@ def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[Fie
     views, recipe = graph.experiment.imaging.views, graph.experiment.imaging.field
     if not graph.objects.has_meshes:
         _log.info(
-            "export: fields are fitted to photographs at views.image_size=%d, as in the run", views.image_size
+            "export: finer fields need meshes of all objects; the run's, fitted to views of %d pixels, are used",
+            views.image_size,
         )
         return graph.fields
     radius = max(graph.radii) if graph.radii is not None else 1.0

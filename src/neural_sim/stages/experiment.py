@@ -36,7 +36,7 @@ from neural_sim.workers import Workers
 SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
 """The score of each task's detectors."""
 _OBJECTIVES = {"AP": ("smooth_ap", SmoothAP), "accuracy": ("smooth_accuracy", SmoothAccuracy)}
-"""For each score, the objective of the psi loop other than the loss: choice of ``outer/objective``, and class."""
+"""For each score, the psi loop's objective other than the loss: its name in ``outer/objective``, and its class."""
 
 
 @dataclass(frozen=True)

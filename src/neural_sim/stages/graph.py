@@ -92,11 +92,14 @@ class Graph(Images):
         )  # fmt: skip
 
     def _on_photographs(self, start: DetectorStage | None) -> PhotographsStage:
-        """Return ``start`` fine-tuned on photographs; None: a detector trained on them alone, as long as on images."""
+        """Return ``start`` fine-tuned on photographs or, if it is None, a detector trained on photographs alone.
+
+        The latter takes as many steps as a detector trained on synthetic images.
+        """
         x, training, real = self.experiment, self._training, self._training.real
         steps = -(-training.images_per_object * len(self.names) // training.batch_size)
         epochs = training.cold_epochs
-        if start is None:  # the same for all modes
+        if start is None:  # with settings, and so a key, that do not depend on the mode
             own = Real("combined", real.count, real.fraction, fewer=real.fewer)
             training = replace(training, real=own)
         else:

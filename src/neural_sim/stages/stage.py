@@ -27,9 +27,9 @@ UNKEYED = {"key": False}
 class Stage(ABC, Generic[T]):
     """One step of a run: a frozen dataclass whose fields are inputs (stages, or tuples of stages) and settings.
 
-    The key of the result covers the settings, the keys of the inputs, and the version of all code imported by the
-    modules of the stage and its settings. Fields whose metadata is ``UNKEYED`` are left out: they only affect speed and
-    messages, or their content is covered by other fields.
+    The key of the result covers the settings, the keys of the inputs, and the version of the code: the modules that
+    define the stage and its settings, with all that they import. Fields whose metadata is ``UNKEYED`` are left out:
+    they only affect speed and messages, or their content is covered by other fields.
     """
 
     phase: str

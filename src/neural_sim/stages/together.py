@@ -46,8 +46,8 @@ def make_together(results: Results, stages: Iterable[Stage[Any]], by: Workers, g
         return
     root = results.store.root.resolve()
     work = Work(_Make(root, results.resume), root, torch.get_num_threads(), gpus)
-    who = "the machines of a Ray cluster" if by == "ray" else f"up to {by} processes"
-    _log.info("%d results, made by %s", len(waiting), who)
+    where = "on the machines of a Ray cluster" if by == "ray" else f"in up to {by} processes"
+    _log.info("making %d results %s", len(waiting), where)
     try:
         with workers(by, len(waiting), work) as submit:
             running: dict[Future[None], str] = {}

@@ -47,7 +47,7 @@ def closure(modules: Iterable[str], root: Path = ROOT) -> set[str]:
 
 @dataclass(frozen=True)
 class _File:
-    """The normalised source of one file, and the modules of the package that it imports."""
+    """A digest of the normalised source of one file, and the modules of the package that it imports."""
 
     meaning: bytes
     imports: tuple[str, ...]

@@ -32,7 +32,7 @@ Health = Literal["ok", "note", "bad"]
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check. A ``note`` costs time or a feature; something ``bad`` stops runs or spoils their results.
+    """Result of one check. ``note``: it costs time or a feature; ``bad``: it stops runs or spoils their results.
 
     Attributes:
         health: ok, note or bad.

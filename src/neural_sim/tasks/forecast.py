@@ -1,4 +1,4 @@
-"""How long a run will take: as its last one took, or by measured costs and the speed of this machine."""
+"""How long a run will take, judging by the last run like it, or by measured costs and the speed of this machine."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ MILLION = 1e6
 
 
 def forecast(context: Context, missing: Sequence[Stage[Any]]) -> str:
-    """Say how long a run will take that lacks these results; empty where nothing is known.
+    """Return a phrase on how long it will take to make the missing results; empty if nothing is known.
 
-    The last run of this name, scale and method says it best. Results that it found in the store count with the time
-    that they took to compute. Without such a run, measured costs say it.
+    The last run with this name, scale and method is the best guide. A result that it found in the store counts with
+    the time that it took to compute. Without such a run, the time is estimated from measured costs.
     """
     if not context.scale or not missing:
         return ""
@@ -104,11 +104,11 @@ def _by_costs(context: Context, missing: Sequence[Stage[Any]]) -> str:
     said = f": about {duration(SPREAD[0] * total)} to {duration(SPREAD[1] * total)} ({parts})"
     if more := sum(_more(stage) for stage in missing):
         said += f", and up to {duration(slower * more)} more if psi takes all iterations"
-    return said + (f"; without {', '.join(unknown)}, unknown until a first run" if unknown else "")
+    return said + (f"; not counting {', '.join(unknown)}, unknown before a first run" if unknown else "")
 
 
 def _with_scored(context: Context, missing: Sequence[Stage[Any]]) -> list[Stage[Any]]:
-    """Add what is scored at the end and is not known by its key yet: psi is not learned."""
+    """Add the detectors scored at the end that tasks do not list: the target's, and that of the psi not yet learned."""
     graph, found = context.graph, list(missing)
     known = {stage.entry for stage in missing}
     if {"evaluate", "report"} & set(context.stages):
@@ -121,7 +121,7 @@ def _with_scored(context: Context, missing: Sequence[Stage[Any]]) -> list[Stage[
 
 
 def _seconds(stage: Stage[Any]) -> float | None:
-    """Return the seconds that a result takes where ``MEASURED`` was measured; None: not known."""
+    """Return the seconds that a result takes on the machine of ``MEASURED``; None: not known."""
     parts = _work(stage)
     if parts is None:
         return None
@@ -164,7 +164,7 @@ def _of_target(stage: TargetSetsStage) -> list[tuple[str, float]] | None:
 
 
 def _of_psi(stage: PsiStage) -> list[tuple[str, float]] | None:
-    """Return the work of a loop as far as it is sure: with ``outer.patience`` it may end after its first iteration."""
+    """Return the work that a loop is sure to do; with ``outer.patience`` it may end after its first iteration."""
     if isinstance(stage.method, Fixed):
         return []
     if not _known_loop(stage):

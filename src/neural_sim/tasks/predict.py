@@ -34,14 +34,15 @@ class PredictTask(Task):
     Args:
         model: a run's folder, or its ``model.safetensors``; None: this run's own, written by its report.
         images: a folder, a glob or a picture.
-        annotations: a COCO file with ground truth; None: no scores.
+        annotations: a COCO file with ground truth; None: no scores. Pictures and classes that it lacks are left out of
+            the results; the pictures are drawn all the same.
         categories: category names of that file -> class names, null to leave a category out. Categories not listed
             are classes of the same name.
-        draw_above: smallest score of a box that is drawn. The results contain every detection of the detector.
+        draw_above: smallest score of a box that is drawn. The results also contain the detections below it.
         batch_size: pictures per batch.
 
     Raises:
-        ValueError: there are no pictures, or a file is not a picture by its header.
+        ValueError: there are no pictures, or the header of a file is not that of a picture.
     """
 
     model: str | None = None

@@ -1,4 +1,4 @@
-"""Task ``report``: write page, figures, the final training set, psi as a table and results.json; log them to MLflow."""
+"""Task ``report``: write the page, figures, final training set, table of psi and results.json; log them to MLflow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Task ``sample``: write data to try the program with: captures, meshes and labelled pictures of embedded objects."""
+"""Task ``sample``: write data to try the program with: captures, meshes and labelled pictures of a run's objects."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class SampleTask(Task):
     @override
     def run(self, context: Context) -> None:
         graph, targets = context.graph, context.results(context.graph.targets)
-        # Built elsewhere and moved at the end: a folder that is there is whole.
+        # Built elsewhere and moved at the end, so that a folder that exists is complete.
         made = context.folder / "sample"
         shutil.rmtree(made, ignore_errors=True)
         for stage in context.shown(graph.views, "views"):
@@ -96,7 +96,7 @@ class SampleTask(Task):
             (folder / video).mkdir(exist_ok=True)
             own = f"{video}/{number % self.frames:03d}.png"
             shutil.move(whole.parent / entry["file_name"], folder / own)
-            del entry["bin"]  # nobody knows it of a photograph
+            del entry["bin"]  # unknown for photographs, which these stand for
             entry["file_name"] = own
         shutil.rmtree(whole.parent)
         write_json(folder / "labels.json", {**document, "camera": camera})
