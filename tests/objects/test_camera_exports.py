@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from neural_sim.objects.motion import Colmap
 from neural_sim.objects.photos import Photos
 
 WIDTH, HEIGHT, FOCAL, COUNT = 48, 36, 56.0, 6
@@ -91,6 +92,16 @@ def colmap_text(
     (model / "images.txt").write_text("\n".join([*change(lines), ""]))
 
 
+def with_other_models(home: Path) -> None:
+    """As nerfstudio, instant-ngp and 3D Gaussian splatting leave it: their models next to the photographs."""
+    written(home, LENS, {}, name="images/frame_{:05d}.png")
+    photographs(home / "images_2", [f"frame_{n:05d}.png" for n in range(COUNT)])
+    for model in ("colmap/sparse/0", "colmap_text", "distorted/sparse/0"):
+        (home / model).mkdir(parents=True)
+        (home / model / "cameras.txt").write_text("damaged")
+
+
+EXPORTS["with_other_models"] = with_other_models
 EXPORTS["colmap_text"] = colmap_text
 EXPORTS["colmap_folders"] = lambda home: colmap_text(home, "left/a b {}.png")
 
@@ -105,6 +116,23 @@ def test_exports_have_every_camera_at_its_place(tmp_path: Path, export: str) -> 
         assert (lens.fx, lens.fy, lens.cx, lens.cy) == pytest.approx((FOCAL, FOCAL, 24.0, 18.0))
         assert not any((*lens.radial, *lens.divisor, *lens.tangential)) and not lens.fisheye
         assert np.asarray(Image.open(frame.image))[15, 20, 0] == 20 * number
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse"])
+def test_a_root_with_photographs_is_one_object_wherever_its_model_lies(tmp_path: Path, place: str) -> None:
+    colmap_text(tmp_path / "thing")
+    (tmp_path / "thing" / "sparse" / "0").rename(tmp_path / "model")
+    (tmp_path / "thing" / "sparse").rmdir()
+    (tmp_path / "thing" / place).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "model").rename(tmp_path / "thing" / place)
+    captures = Photos(tmp_path / "thing").captures
+    assert list(captures) == ["thing"] and len(captures["thing"].frames) == COUNT
+
+
+def test_what_programs_leave_next_to_photographs_is_no_object(tmp_path: Path) -> None:
+    with_other_models(tmp_path / "thing")
+    assert list(Photos(tmp_path / "thing").captures) == ["thing"]
+    assert Photos(tmp_path / "thing", poses=Colmap()).names() == ["thing"]
 
 
 def spoilt(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
@@ -193,6 +221,6 @@ def test_masks_of_one_name_in_several_folders_are_refused(tmp_path: Path) -> Non
     mask.parent.mkdir()
     Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
     with pytest.raises(
-        ValueError, match=r"masks/000\.png: by its name is the mask of both .*cam0/000\.png and .*cam1"
+        ValueError, match=r"masks/000\.png: its name makes it the mask of both .*cam0/000\.png and .*cam1"
     ):
         Photos(tmp_path)

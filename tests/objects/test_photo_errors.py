@@ -129,7 +129,7 @@ def test_a_folder_of_one_object_is_its_root(made):
 
 def test_photographs_alone_are_refused_with_what_finds_their_cameras(made, tmp_path):
     shutil.copytree(made["transforms"].folder / "images", tmp_path / "can")
-    with pytest.raises(ValueError, match=r"objects/poses=colmap finds the cameras of photographs alone"):
+    with pytest.raises(ValueError, match=r"objects/poses=colmap finds cameras from photographs alone"):
         Photos(tmp_path)
 
 
@@ -176,6 +176,8 @@ def test_a_model_that_colmap_cannot_read_is_named(made, tmp_path):
         ({"up": {"can": [0, 0, 0]}}, r"Photos\.up\.can: want .* three numbers, not all of them zero"),
         ({"size": -1.0}, r"Photos\.size: want more than 0 or a mapping or null, got -1"),
         ({"size": {"can": float("inf")}}, r"Photos\.size\.can: want more than 0 and finite or null, got inf"),
+        ({"size": {"pan": 0.1}}, r"objects\.size: 'pan' is not an object, want some of .*can"),
+        ({"mask_value": {"can": 1, "mug": 2}}, r"objects\.mask_value: 'mug' is not an object"),
         ({"names": []}, r"Photos\.names: want 1 or more values or null, got \[\]"),
         ({"names": ["mug"]}, r"objects\.names: 'mug' is not in"),
         ({"masks": "scene"}, r"objects\.masks=scene: want objects\.scene, which computes masks, got none"),

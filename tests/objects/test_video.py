@@ -90,7 +90,7 @@ def test_a_folder_with_a_video_is_an_object(tmp_path):
     write(tmp_path / "mug" / "clip.mov")
     photos = Photos(tmp_path, poses=Colmap(), frames=9)
     assert photos.names() == ["mug"] and len(photos.images("mug")) == 9
-    with pytest.raises(ValueError, match="objects/poses=colmap finds the cameras"):
+    with pytest.raises(ValueError, match="objects/poses=colmap finds cameras from photographs"):
         Photos(tmp_path)
 
 

@@ -102,5 +102,5 @@ def test_the_command_line_asks_for_them(alone, tmp_path, monkeypatch):
     assert stage.refinement.rounds == 3 and stage.objects.source.poses == Colmap(features=900)
     assert len(stage.objects.source.captures["can"].frames) == 11
     given = composed("objects=photos", "scale=smoke", "stages=[views]", *where)
-    with pytest.raises(ValueError, match="objects/poses=colmap finds the cameras"):
+    with pytest.raises(ValueError, match="objects/poses=colmap finds cameras"):
         context_of(given, tmp_path)

@@ -13,18 +13,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neural_sim.objects.album import FOLDER, Album, Shot, pictures_of, read_album
+from neural_sim.objects.album import FOLDER, Album, Shot, read_album
 from neural_sim.objects.capture import Capture, Frame
-from neural_sim.objects.colmap import model_folders, read_colmap
+from neural_sim.objects.colmap import PLACES, model_folders, read_colmap
 from neural_sim.objects.files import Names, choose, content_digest, folder_of
 from neural_sim.objects.found import FoundCapture
 from neural_sim.objects.mask_command import MaskCommand
 from neural_sim.objects.mesh import MeshSource
 from neural_sim.objects.pictures import (
-    FOLDER as MASKS_FOLDER,
-)
-from neural_sim.objects.pictures import (
     MADE,
+    MASKS_FOLDER,
     Box,
     Corners,
     Direction,
@@ -43,7 +41,7 @@ from neural_sim.objects.pictures import (
 from neural_sim.objects.placing import AXES, Placement, mean_up, nearest_to_axes, place, upright
 from neural_sim.objects.resampling import pixels_per_pixel, resample
 from neural_sim.objects.transforms_json import has_transforms, read_transforms
-from neural_sim.objects.video import take_frames, videos_of
+from neural_sim.objects.video import can_be_captured, take_frames
 from neural_sim.pictures import read_header, read_picture
 from neural_sim.ranges import Matching, NonNegativeInt, Positive, PositiveInt, validated
 from neural_sim.types import PosedViews
@@ -109,8 +107,8 @@ class Photos:
 
     Raises:
         ValueError: a folder is missing or has no captures, a name is unknown, ``masks="scene"`` has no ``scene``,
-            ``box`` is set without ``masks="scene"``, ``masks="command"`` has no command, a reader refuses its capture,
-            or a name is also that of a mesh in ``beside``.
+            ``box`` is set without ``masks="scene"``, only one of ``masks="command"`` and ``mask_command`` is set, a
+            reader refuses its capture, or a name is also that of a mesh in ``beside``.
     """
 
     def __init__(
@@ -132,6 +130,11 @@ class Photos:
     ) -> None:
         self.root, self.poses, self.beside = folder_of(root), poses, beside
         captures = self._found()
+        for key, value in {"up": up, "size": size, "box": box, "mask_value": mask_value}.items():
+            if isinstance(value, Mapping) and (strange := value.keys() - captures.keys()):
+                raise ValueError(
+                    f"objects.{key}: {min(strange)!r} is not an object, want some of {', '.join(captures)}"
+                )
         self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
         self.up, self.size, self.box, self.scene, self.poor = up, size, box, scene, poor
@@ -167,13 +170,15 @@ class Photos:
                     refuse_shared(found, file, shot.image)
 
     def _found(self) -> dict[str, Path]:
-        """Find the captures' folders by object name: those below the root or, without any, the root itself."""
+        """Find the captures' folders by object name: the root if it is an object's folder, else those below it."""
         usable = is_capture if self.poses is None else can_be_captured
+        # Programs write more models and photographs into an object's folder, such as colmap/sparse/0 and images_2.
+        one = has_transforms(self.root) or any((self.root / place).is_dir() for place in PLACES)
         below = [
             p for p in sorted(self.root.iterdir()) if p.is_dir() and p.name not in (FOLDER, MASKS_FOLDER)
         ]
         captures = {p.name: p for p in below if usable(p)}
-        if not captures and usable(self.root):
+        if usable(self.root) and (one or not captures):
             return {self.root.resolve().name: self.root}
         if not captures:
             if self.poses is not None:
@@ -183,7 +188,7 @@ class Photos:
             bare = any(can_be_captured(p) for p in (self.root, *below))
             raise ValueError(
                 f"objects.root: {self.root} holds no folder with a transforms.json or a COLMAP model"
-                + ("; objects/poses=colmap finds the cameras of photographs alone" if bare else "")
+                + ("; objects/poses=colmap finds cameras from photographs alone" if bare else "")
             )
         return captures
 
@@ -381,11 +386,6 @@ def _named(files: Iterable[Path], folder: Path) -> dict[str, Path]:
     return {
         str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path): path for path in files
     }
-
-
-def can_be_captured(folder: Path) -> bool:
-    """Return whether a folder has a video, or pictures in it or in its subfolder ``images``."""
-    return bool(pictures_of(folder) or videos_of(folder))
 
 
 def is_capture(folder: Path) -> bool:

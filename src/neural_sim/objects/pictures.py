@@ -23,7 +23,7 @@ from neural_sim.ranges import Matching, check, validated
 
 Masks = Literal["auto", "alpha", "files", "scene", "command"]
 MADE = ("scene", "command")
-"""Masks that are computed before photographs are read."""
+"""Sources whose masks are computed for all photographs together, not looked up for each."""
 Direction = tuple[float, float, float]
 Corners = tuple[Direction, Direction]
 """Lowest and highest corner of a box along the axes of the capture's frame, in its unit."""
@@ -36,7 +36,7 @@ Box = Annotated[
 ]
 BOX_FILE = "box.json"
 """File with the object's box in the capture's folder, saved by the page of ``stages=[box]``."""
-FOLDER = "masks"
+MASKS_FOLDER = "masks"
 SHARPNESS = 4.0
 """Factor that steepens the opacity of scene masks around one half: objects become opaque, and fog vanishes."""
 
@@ -127,7 +127,7 @@ class Pictures:
         if mask is None:
             raise ValueError(
                 f"{frame.image}: has no mask of the object; want an alpha channel that is not opaque everywhere, a "
-                f"mask_path, or a mask of its name in a folder {FOLDER!r}; objects.masks=scene computes masks"
+                f"mask_path, or a mask with its name in a folder {MASKS_FOLDER!r}; objects.masks=scene computes masks"
             )
         return torch.cat([colours, mask[:, :, None]], -1)
 
@@ -170,8 +170,8 @@ def refuse_shared(found: dict[Path, Path], file: Path, image: Path) -> None:
     other = found.setdefault(file, image)
     if other != image:
         raise ValueError(
-            f"{file}: by its name is the mask of both {other} and {image}; want one for each in {FOLDER!r}, in the "
-            f"same subfolders as the photographs, such as {image.parent.name}/{image.name}.png"
+            f"{file}: its name makes it the mask of both {other} and {image}; want one for each in {MASKS_FOLDER!r}, "
+            f"in the same subfolders as the photographs, such as {image.parent.name}/{image.name}.png"
         )
 
 
@@ -190,7 +190,7 @@ def mask_beside(image: Path, source: Path) -> Path | None:
     """Find the mask of ``image.jpg`` in a folder of masks: ``image.jpg.png`` (COLMAP), ``image.png`` or ``image.jpg``.
 
     The folder is next to the image or to one of the folders around it, up to the one that also holds ``source``. In it,
-    a mask may have the same sub-folders as its image.
+    a mask may lie in the same subfolders as its image.
     """
     whole = os.path.abspath(image.parent)
     home = os.path.commonpath([whole, os.path.abspath(source if source.is_dir() else source.parent)])
@@ -204,8 +204,8 @@ def mask_beside(image: Path, source: Path) -> Path | None:
         ]  # also without the images' own folder, and by the file's name alone
         for part in dict.fromkeys(inner):
             for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
-                if (folder / FOLDER / part / name).is_file():
-                    return folder / FOLDER / part / name
+                if (folder / MASKS_FOLDER / part / name).is_file():
+                    return folder / MASKS_FOLDER / part / name
     return None
 
 

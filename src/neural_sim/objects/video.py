@@ -31,6 +31,11 @@ def videos_of(folder: Path) -> list[Path]:
     return without_leftovers(own, folder)
 
 
+def can_be_captured(folder: Path) -> bool:
+    """Return whether a folder has a video, or pictures in it or in its subfolder ``images``."""
+    return bool(pictures_of(folder) or videos_of(folder))
+
+
 def take_frames(folder: Path, name: str, count: int) -> None:
     """Write frames of a folder's video into its folder ``images``, unless it has photographs.
 
@@ -65,8 +70,8 @@ def take_frames(folder: Path, name: str, count: int) -> None:
     finally:
         shutil.rmtree(place, ignore_errors=True)
     _log.info(
-        "%s: took %d frames of %s, the sharpest of as many equal parts, and wrote them to %s; to take another number "
-        "(objects.frames), delete that folder", name, taken, videos[0].name, images,
+        "%s: took %d frames of %s, the sharpest in each of as many equal parts, and wrote them to %s; to take another "
+        "number (objects.frames), delete that folder", name, taken, videos[0].name, images,
     )  # fmt: skip
 
 
