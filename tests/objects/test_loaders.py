@@ -108,6 +108,14 @@ def test_bop_without_info_is_unchecked_and_says_so(tmp_path, caplog):
     assert "models_info.json is missing" in caplog.text
 
 
+def test_a_bop_file_without_a_number_is_named(tmp_path):
+    root = _bop(tmp_path / "models", (30.0, 40.0, 120.0), 130.0)
+    (root / "obj_000007_old.ply").write_bytes((root / "obj_000007.ply").read_bytes())
+    with pytest.raises(ValueError, match=r"obj_000007_old\.ply: want a number after obj_"):
+        BOP(root)
+    assert BOP(root, [7]).names() == ["obj_000007"]
+
+
 def test_folder_takes_files_and_sub_folders(tmp_path):
     box = trimesh.creation.box((0.2, 0.4, 0.6))
     for suffix in ("ply", "stl", "obj", "glb"):
@@ -177,3 +185,21 @@ def test_a_vertex_far_from_all_others_is_told(tmp_path, caplog):
     ball.export(tmp_path / "ball.ply")
     MeshFolder(tmp_path).load()
     assert "times as far from the middle as any other; is a digit wrong?" in caplog.text
+
+
+@pytest.mark.parametrize("stray", ["4 0 0", "nan nan nan"])
+def test_vertices_without_a_face_do_not_count(tmp_path, caplog, stray):
+    ball = trimesh.creation.icosphere(2)
+    vertices = [" ".join(map(str, row)) for row in ball.vertices]
+    faces = [" ".join(map(str, [3, *row])) for row in ball.faces]
+    header = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(vertices) + 1}\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face {len(faces)}\nproperty list uchar int vertex_indices\nend_header"
+    )
+    (tmp_path / "ball.ply").write_text("\n".join([header, *vertices, stray, *faces, ""]))
+    with caplog.at_level("INFO"):
+        (item,) = MeshFolder(tmp_path).load()
+    assert item.radius == pytest.approx(1.0, abs=1e-6) and item.transform[:3, 3] == pytest.approx(
+        0.0, abs=1e-6
+    )
+    assert "object 'ball': dropped 1 vertices without a face" in caplog.text

@@ -102,6 +102,14 @@ def test_what_a_command_fails_at_is_said(tmp_path, photographs, text, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_command_that_cannot_be_run_is_named(tmp_path, photographs):
+    path = tmp_path / "no_shebang"
+    path.write_text("echo\n")
+    path.chmod(0o755)
+    with pytest.raises(ValueError, match=r"objects\.mask_command: .*no_shebang cannot be run: Exec format"):
+        MaskCommand(f"{shlex.quote(str(path))} {{images}} {{masks}}").masks(photographs)
+
+
 def test_captures_take_their_masks_from_a_command(tmp_path):
     made = capture(tmp_path, count=4, width=80, height=60)
     (made.folder / "masks").rename(made.folder / "elsewhere")

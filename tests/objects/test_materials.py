@@ -90,7 +90,8 @@ def test_a_name_that_several_files_have_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "mtl", "reason"),
     [
-        ("usemtl b\nf 1 2 3", "newmtl a\nKd 1 0 0", r"usemtl 'b' is in no material library; m\.mtl has 'a'"),
+        ("usemtl b\nf 1 2 3", "newmtl a\nKd 1 0 0", r"usemtl 'b' is in no material library; materials in m\.mtl: 'a'"),
+        ("usemtl b\nf 1 2 3", None, r"usemtl 'b' wants a material library, but none was found"),
         ("usemtl a\nf 1 2 3", "newmtl a\nmap_Kd gone.png", r"m\.mtl, line 2: the texture 'gone\.png' was not"),
         ("usemtl a\nf 1 2 3", "newmtl a\nKd red", r"m\.mtl, line 2: want Kd with three numbers, got 'red'"),
         ("usemtl a\nf 1 2 3", "newmtl a\nmap_Kd -zoom 2 a.png", r"unknown option -zoom"),

@@ -30,7 +30,8 @@ class BOP(MeshFiles):
         names: objects as 'obj_000001', '000001', '1' or 1; None: all.
 
     Raises:
-        ValueError: the folder does not exist or has no ``obj_*.ply``, or a name is unknown.
+        ValueError: the folder does not exist or has no ``obj_*.ply``, a name is unknown, or a file is not
+            named ``obj_`` and a number.
     """
 
     def __init__(self, root: str | Path, names: Annotated[list[str | int], MinLen(1)] | None = None) -> None:
@@ -43,14 +44,17 @@ class BOP(MeshFiles):
             aliases[number.lstrip("0") or "0"] = stem
         wanted = None if names is None else [str(name) for name in names]
         super().__init__(folder, files, wanted, aliases, "obj_*.ply; want a BOP models folder")
+        strange = [path for name, path in self._files.items() if not name.removeprefix("obj_").isdecimal()]
+        if strange:
+            raise ValueError(f"objects.root: {strange[0]}: want a number after obj_, as in obj_000001.ply")
         self._info = folder / "models_info.json"
 
     def load(self) -> list[ObjectMesh]:
         """Load the objects, normalised, in the order of ``names``; their transforms give metres.
 
         Raises:
-            ValueError: a file cannot be read, or a mesh does not have the diameter in models_info.json, neither in
-                millimetres nor in metres.
+            ValueError: a file cannot be read, or the diameter of a mesh is not that in models_info.json, whether the
+                file is taken to be in millimetres or in metres.
         """
         diameters, digests = self._diameters(), self.digests()
         items = []

@@ -163,7 +163,8 @@ def _check_counts(path: Path, kind: str) -> None:
             take(16 * take(4))
         elif kind == "images":
             take(64)
-            take(data.find(b"\0", at) + 1 - at if b"\0" in data[at:] else len(data))
+            end = data.find(b"\0", at)
+            take(end + 1 - at if end >= 0 else len(data))
             take(24 * take(8))
         else:
             take(43)

@@ -49,7 +49,7 @@ class MaskCommand:
         """Return the program's mask of each photograph; if masks are label images, the object has ``value``.
 
         Raises:
-            ValueError: the program fails, a photograph has no mask, or a mask cannot be read.
+            ValueError: the program cannot be run or fails, a photograph has no mask, or a mask cannot be read.
         """
         with tempfile.TemporaryDirectory(prefix="neural-sim-") as place:
             given, made = Path(place) / "images", Path(place) / "masks"
@@ -71,13 +71,11 @@ class MaskCommand:
         return [word.replace(PLACES[0], images).replace(PLACES[1], masks) for word in words]
 
     def _run(self, images: Path, masks: Path) -> None:
-        done = subprocess.run(
-            self._words(str(images), str(masks)),
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
+        words = self._words(str(images), str(masks))
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
+        except OSError as error:
+            raise ValueError(f"{KEY}: {words[0]} cannot be run: {error.strerror}") from error
         if done.returncode:
             said = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
             last = said[-1].strip() if said else "no output"

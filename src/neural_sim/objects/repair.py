@@ -25,9 +25,10 @@ OUTLIER = 1.5
 def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     """Copy a mesh so that it can be rendered, and log every repair as a warning.
 
-    The copy has no degenerate faces, finite normals, and colours. If a normal is not finite or too short, all are
+    The copy has finite normals and colours, and no degenerate faces. If a normal is not finite or too short, all are
     recomputed from the faces. A mesh without colours, or with a missing texture, gets its material's colour or grey.
-    More than ``HUGE_FACES`` faces only give a warning.
+    More than ``HUGE_FACES`` faces only give a warning. Vertices without a face, which the parts of glTF files often
+    have, are dropped without one.
 
     Raises:
         ValueError: no face has positive area and finite vertices; the message has ``source``.
@@ -38,7 +39,7 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     _warn_of_outlier(np.asarray(mesh.vertices), name, source)
     if len(mesh.faces) > HUGE_FACES:
         log.warning(
-            "%s: object %r has %d faces; more than %d are slow to draw, decimate it if views take long",
+            "%s: object %r has %d faces; more than %d are slow to draw: decimate the mesh if views take long",
             source, name, len(mesh.faces), HUGE_FACES,
         )  # fmt: skip
     mesh = _with_finite_normals(mesh, name, source)
@@ -63,6 +64,10 @@ def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh
             source, name, int((~good).sum()), len(good),
         )  # fmt: skip
         mesh.update_faces(good)
+    # Vertices without a face cannot be seen, but would count in the object's size.
+    unused = len(vertices) - len(np.unique(mesh.faces))
+    if unused:
+        log.info("%s: object %r: dropped %d vertices without a face", source, name, unused)
         mesh.remove_unreferenced_vertices()
     return mesh
 

@@ -134,9 +134,13 @@ def _material(
             _log.warning("%s: no usemtl before %d faces; they get the only material, %r", path, faces, only)
             return materials[only]
         return Material()
+    if not libraries:
+        raise ValueError(
+            f"usemtl {name!r} wants a material library, but none was found; put it next to the file, or remove usemtl"
+        )
     known = ", ".join(repr(other) for other in materials) or "none"
-    files = ", ".join(library.name for library in libraries) or "no mtllib"
-    raise ValueError(f"usemtl {name!r} is in no material library; {files} has {known}")
+    files = ", ".join(library.name for library in libraries)
+    raise ValueError(f"usemtl {name!r} is in no material library; materials in {files}: {known}")
 
 
 # --- materials ---
