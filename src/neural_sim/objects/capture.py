@@ -34,8 +34,8 @@ class Lens:
     Lengths are in pixels; the principal point is measured from the image's upper left corner (the first pixel's centre
     is (0.5, 0.5), as in COLMAP and nerfstudio). A point (x, y) of the plane at distance 1, with radius r, is scaled by
     (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + divisor[0] r^2 + ...), then shifted by the ``tangential`` p1 and
-    p2. With ``fisheye``, the point is first moved to a radius equal to its angle off the axis, which then is r, and
-    there is no tangential term.
+    p2. With ``fisheye``, r is the point's angle off the axis; the point is first moved to that radius, and there is no
+    tangential term.
 
     Raises:
         ValueError: a size or focal length is not positive, a number is not finite, or a length is not in pixels.
@@ -203,7 +203,8 @@ def say_missing(source: Path, missing: Sequence[str], listed: int) -> None:
     """
     if missing and len(missing) == listed:
         raise ValueError(
-            f"{source}: all of its {listed} photographs are missing, such as {missing[0]}; put them where it says"
+            f"{source}: all of its {listed} photographs are missing, such as {missing[0]}; put them at the "
+            "paths that it lists"
         )
     if missing:
         _log.warning(

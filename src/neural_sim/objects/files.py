@@ -135,7 +135,7 @@ def choose(
 
 
 def _written(value: Any, names: Sequence[str]) -> str:
-    """Return the only name that the command line would parse as this value; if there is none, the value as text."""
+    """Return the one name that the command line would parse as this value; if none or several, the value as text."""
     words = {None: ("null",), True: ("true",), False: ("false",)}
     if value is None or isinstance(value, bool):
         alike = [name for name in names if name.lower() in words[value]]

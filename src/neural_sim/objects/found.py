@@ -28,7 +28,7 @@ MOST_TURNS = 0.5
 POOR_ERROR = 1.5
 """Mean error, in pixels of the reduced photographs, above which cameras are doubted; good captures have 0.3 to 0.8."""
 FEW = 0.7
-"""Fraction of the photographs with cameras below which a warning says what to do about the missing ones."""
+"""If cameras of fewer than this fraction of the photographs are found, a warning says what to do."""
 NAMED = 12
 """Largest number of photographs that a message lists by name."""
 ONE_SIDED = 0.2

@@ -92,7 +92,7 @@ def flat_box(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def mug(generator: torch.Generator) -> trimesh.Trimesh:
-    """Make an open red cylinder, white inside, with the box's emblem on +x and its handle on -x."""
+    """Make an open red cylinder, white inside, with the boxes' emblem on +x and a handle on -x."""
     side = Print(512, 256, RED)
     side.rectangle(0.36, 0.2, 0.64, 0.8, WHITE)
     side.disc(0.5, 0.5, 0.08, 0.22, BOX_EMBLEM)

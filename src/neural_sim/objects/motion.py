@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 ALL_PAIRS = 40
 """Largest number of photographs for which ``matching="auto"`` compares every pair."""
 SKELETON = 5
-"""Stride of the coarse selection, in which every pair is compared: a walk may end where it began."""
+"""With ``matching="auto"``, all pairs among every fifth photograph are compared: a walk may end where it began."""
 LARGE = 800
 """Longer side in pixels from which features are searched for only at the photographs' own size."""
 BATCH = 8
@@ -51,9 +51,11 @@ class Colmap:
 
     Args:
         picture_size: longer side in pixels to which larger photographs are reduced for the search.
-        features: largest number of features in a photograph.
-        matching: which photographs are compared: ``exhaustive``: all; ``sequential``: those nearby in the order of
-            their names; ``auto``: all of up to 40, otherwise nearby ones and a coarse selection of all.
+        features: approximate number of features to keep of each photograph, those with the largest scales; COLMAP
+            may keep nearly twice as many.
+        matching: which pairs of photographs are compared. ``exhaustive``: all; ``sequential``: those nearby in the
+            order of their names; ``auto``: all of up to 40 photographs; of more, nearby ones and all pairs among every
+            fifth photograph.
         overlap: number of following photographs with which each is compared, if not all pairs are; those 1, 2, 4, 8,
             ... places further on are added.
         region: which part of a photograph is searched. ``all``: all of it; ``object``: only what the masks show;

@@ -24,14 +24,14 @@ AXES = {
     for sign, axis in itertools.product("+-", "xyz")
 }
 SMALL = 256
-"""Longer side, in pixels, of the silhouettes that carve the hull."""
+"""Silhouettes that carve the hull are reduced to a longer side of at least this many pixels."""
 NEARLY_ALL = 0.95
 """Fraction of a photograph that a mask may cover before it is doubted."""
 CELLS = 48
 """Number of cells along each side of the cube that is carved."""
 OUTSIDE = 0.05
-"""Largest fraction of the views that see a hull cell in which it may lie outside the silhouette, because poses and
-masks of photographs are not exact."""
+"""A hull cell may lie outside the silhouettes of this fraction of the views that see it, because poses and masks of
+photographs are not exact."""
 SEEN_BY = 0.5
 """Fraction of all views that must see a hull cell; those seen by few lie at the edges of photographs."""
 

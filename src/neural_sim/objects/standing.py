@@ -18,7 +18,7 @@ LONGER = 200
 TEXTURE = 0.03
 """Contrast of a pixel with its surroundings, relative to white, above which it could show the camera's motion."""
 CHANGE = 0.35
-"""Largest change of a standing pixel from its usual value, relative to its contrast: exposure and noise change less."""
+"""Largest change of a standing pixel from its usual value, relative to its contrast; exposure and noise cause less."""
 STILL = 0.8
 """Fraction of the photographs in which a standing pixel has its usual value."""
 LEAST_SHARE = 0.15
