@@ -14,8 +14,8 @@ from torch import Tensor
 
 from neural_sim.parameter.distributions import project_simplex
 
-# Smallest softmax of a bin, relative to the largest bin's, that ``bounded`` allows, in units of the floor. There, p
-# exceeds the floor by at most this fraction of it.
+# ``bounded`` keeps every bin's softmax at or above this fraction of the floor times the largest bin's softmax. At that
+# bound, p exceeds the floor by at most this fraction of it.
 LOWEST = 0.25
 # Logit of a closed bin, from which nothing may be drawn, such as one that no photograph of the object shows. Its p is
 # 0, without a floor, and no step reopens it. Steps never reach so low a logit, so it cannot be mistaken for an open
@@ -72,8 +72,8 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Compute log w for w = p - ``floor``, without cancellation.
 
-    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)); divided by w, it is the derivative with respect to
-    p, up to a constant. Divided by p instead, it would vanish for bins at the floor.
+    The derivative of any f(p) with respect to psi is w (f' - sum(w f') / sum(w)); divided by w, it is f', the
+    derivative with respect to p, up to a constant. Divided by p instead, it would vanish for bins at the floor.
     """
     closed = is_closed(psi)
     if not bool(closed.any()):

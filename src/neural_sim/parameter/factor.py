@@ -141,7 +141,7 @@ class Factor(Protocol):
 @validated
 @dataclass(frozen=True)
 class BinnedFactor:
-    """A factor whose part of psi has the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
+    """A factor of one coordinate, whose part of psi has the logits of ``bins`` equal bins of [``low``, ``high``].
 
     Args:
         name: name of the factor, and of the configuration node ``parameter.<name>``.

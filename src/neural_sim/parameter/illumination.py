@@ -164,7 +164,7 @@ class Illumination:
         return psi.expand(count, -1)
 
     def explore(self, psi: Float[Tensor, "k"], noise: Float[Tensor, "n k"]) -> GaussianDraw:
-        """Draw from N(psi, deviation^2 I) by standard normal ``noise``, and project; detached from psi."""
+        """Draw from N(psi, deviation^2 I) using standard normal ``noise``, and project; detached from psi."""
         unprojected = psi.detach() + self.deviation * noise
         return GaussianDraw(unprojected, self.project(unprojected))
 

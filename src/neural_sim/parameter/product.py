@@ -252,7 +252,7 @@ class SceneDistribution:
         return SceneNoise(noise, dict(zip(drawn, uniform.unbind(), strict=True)), light)
 
     def hard(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
-        """Draw exact samples of p_psi; not differentiable by psi."""
+        """Draw exact samples of p_psi; not differentiable in psi."""
         parts = self.split(psi)
         bins = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned}
         return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
@@ -321,7 +321,7 @@ class SceneDistribution:
         return torch.stack(logs).sum(0)
 
     def statistics(self, draw: SceneDraw) -> dict[str, Num[Tensor, "n _"]]:
-        """Compute sufficient statistics of each factor's psi.
+        """Compute sufficient statistics for each factor's psi.
 
         For bins they are the drawn bin as a one-hot vector; for lights, the drawn weights before their projection,
         centred. Lights that were not drawn around psi have none.

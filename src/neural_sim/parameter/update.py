@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 Momentum = Annotated[float, Ge(0), Lt(1)]
 CLIP = 10.0
-"""``Mirror`` scales down a direction whose root mean square exceeds the largest average's so far by this factor."""
+"""``Mirror`` limits a direction's root mean square to this many times the largest that its average has had so far."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class SGD:
 class Mirror:
     """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
 
-    In logits, the direction is the gradient with respect to p (that with respect to the logits divided by p - floor),
+    In logits, the direction is the gradient with respect to p (that with respect to the logits, divided by p - floor),
     centred: a bin of small p takes as long a step as one of large p. Momentum averages the direction. The average is
     divided by the largest value so far of its root mean square over all objects and bins, so that ``learning_rate`` is
     in logits per step whatever the units of the loss, and steps shorten with the gradient. (A scale that decays would

@@ -1,1 +1,1 @@
-"""Estimate psi from the target's labelled boxes by label shift, without training a detector."""
+"""Estimate psi from the target's labelled boxes under label shift, without training a detector."""

@@ -20,8 +20,8 @@ from neural_sim.types import LabelledImages
 SIDE = 32
 """Side of the network's input, in pixels."""
 MARGIN = 1.5
-"""Side of a stored crop, in multiples of the box's longer side: large enough that rotated and shifted views have
-pixels."""
+"""Side of a stored crop, in multiples of the box's longer side: it contains nearly all of a rotated and shifted view,
+the rest of which repeats the crop's border."""
 _STORED = 44
 _SHOWN = 1.1  # side of the network's view, in multiples of the box's longer side
 BOX_NUMBERS = 5
@@ -98,7 +98,8 @@ class Augmentation:
         blur: largest fraction of a crop's detail that is lost.
         noise: largest standard deviation of pixel noise.
         occlusion: fraction of the crops in which a rectangle is hidden.
-        jitter: scale of the random errors of a box's size and place, as a fraction of its sides.
+        jitter: largest change of a crop's scale, and largest shift in multiples of the box's longer side. The numbers
+            that describe the box change by up to 1.5 times as much.
     """
 
     roll_deg: Annotated[float, Ge(0), Le(180)] = 10.0

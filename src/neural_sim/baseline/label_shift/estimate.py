@@ -1,4 +1,4 @@
-"""Estimate psi from a target's labelled boxes by label shift, in seconds and without a detector.
+"""Estimate psi from a target's labelled boxes under label shift, in seconds and without a detector.
 
     estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
 
@@ -40,7 +40,7 @@ class Estimate:
 
     Attributes:
         factors: the estimates of all factors, object by object.
-        psi: the present psi, with the factors that move replaced.
+        psi: the present psi, in which estimates replace the factors that move.
         images: number of crops of renders, for training and held out.
         seconds: duration.
         cpu_seconds: processor seconds by phase: pool, images, network, evidence.

@@ -41,9 +41,10 @@ class Span:
     def of(
         p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], now: Float[Tensor, "k"], covered: float
     ) -> Span:
-        """Take intervals that cover the central fraction ``covered`` of random draws of what p estimates.
+        """Compute intervals that contain the central fraction ``covered`` of ``drawn``, and both total variations.
 
-        ``now`` are the probabilities at the present psi.
+        ``drawn`` are random draws of the target's probabilities, which ``p`` estimates; ``now`` are those at the
+        present psi.
         """
         tail = 0.5 * (1.0 - covered)
         low, high = (tuple(drawn.quantile(part, 0).tolist()) for part in (tail, 1.0 - tail))
@@ -69,10 +70,10 @@ class FactorEstimate:
             renders.
         accuracy: fraction of held-out renders whose group of bins is recognised; for lights, the fraction of the
             guesses' variance that weights explain.
-        finding: whether psi moves. It ``moves`` to the estimate; or it moves there although the boxes leave much open,
-            because the estimate is certainly ``nearer`` to the target than the present psi is; or it ``stays`` because
-            the target may be at the present psi. Otherwise it does not move because the estimate is ``uncertain``,
-            renders are ``not told apart``, the target ``fits no render``, or there are ``too few boxes``.
+        finding: whether psi moves to the estimate. It does if the finding is ``moves``, or ``nearer``: the estimate is
+            not final, but is expected to be much nearer to the target than the present psi is. It ``stays`` if the
+            target may be at the present psi. Nor does it move if the estimate is ``uncertain``, renders are
+            ``not told apart``, the target ``fits no render``, or there are ``too few boxes``.
         chance: accuracy of guessing without looking.
         doubt: expected total variation between the estimate and the target's distribution.
         apart: the same between the present psi and the target's distribution.

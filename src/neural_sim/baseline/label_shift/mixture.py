@@ -1,8 +1,8 @@
 """The mixture of bins that explains a sample: expectation maximisation, posterior draws and a test (pure functions).
 
-A classifier trained on renders of equally frequent cells c (a bin of every factor) gives the posterior q(c | x) of a
-box x, in proportion to the likelihood p(x | c). Boxes of the target are a mixture p(x) = sum_c p_c p(x | c), whose
-maximum-likelihood p is the fixed point of (Saerens, Latinne and Decaestecker 2002, equation 2.10)
+A classifier trained on renders of equally frequent cells c (a bin of every factor) gives a box x the posterior
+q(c | x), which is proportional to the likelihood p(x | c). Boxes of the target are a mixture p(x) = sum_c p_c p(x | c),
+whose maximum-likelihood p is the fixed point of (Saerens, Latinne and Decaestecker 2002, equation 2.10)
 
     p_c <- mean_n r_n(c),    r_n(c) = p_c q(c | x_n) / sum_d p_d q(d | x_n).
 
@@ -176,7 +176,7 @@ def posterior(
 
     The Dirichlet prior has the parameter ``prior``, so that, given the boxes' cells, the mean of p is the update of
     ``maximise``. (With ``prior`` + 1, that would be the mode, and a bin with nearly all boxes would get too little
-    probability.) If the likelihood itself was estimated, ``samples`` of it divide the chains among them.
+    probability.) If the likelihood itself was estimated, the chains are divided among ``samples`` of it.
 
     Returns:
         ``chains`` x ``kept`` draws of every factor's probabilities, [draws, k].
@@ -213,9 +213,9 @@ def ratio_test(
 ) -> float:
     """Compute the p-value of the null hypothesis that some factors have given distributions, by parametric bootstrap.
 
-    The statistic is twice the logarithm of the likelihood ratio. Its null distribution comes from samples of as many
-    ``known`` boxes, with cells drawn from the null (for other factors, from the best fit under it): the classifier errs
-    on them as on the target's boxes.
+    The statistic is twice the logarithm of the likelihood ratio. Its null distribution comes from samples of the
+    ``known`` boxes, on which the classifier errs as it does on the target's. Each sample has as many boxes as the
+    target, with cells drawn from the null (for other factors, from the best fit under it).
 
     Args:
         likelihood: likelihood of each box in every cell.

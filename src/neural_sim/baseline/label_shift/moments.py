@@ -1,6 +1,6 @@
 """Estimate the weights of lights by matching moments (pure functions).
 
-All images of an object share one light, so they are no mixture. Guesses y of the weights w are biased towards the
+All images of an object share one light, so they are not a mixture. Guesses y of the weights w are biased towards the
 weights of common renders, and so are not estimates themselves; but over held-out renders of known weights, their mean
 is nearly linear: E[y | w] = B w. The estimate is the w at which this mean is nearest to the mean guess of the target's
 boxes, ybar (indirect inference, Gourieroux, Monfort and Renault 1993):
@@ -68,7 +68,7 @@ class Response:
         return self.scatter * (1.0 + 1.0 / boxes + weights @ self.precision @ weights)
 
     def misfits(self, guesses: Float[Tensor, "n m"], project: Project) -> Float[Tensor, "n"]:
-        """Compute each guess's distance from the nearest B w, as in Hansen's test of overidentification."""
+        """Compute each guess's distance from the nearest B w, as in Hansen's test of overidentifying restrictions."""
         nearest = matched(guesses, self.slope, self.scatter, project)
         return distance(guesses, nearest, self.slope, self.scatter)
 

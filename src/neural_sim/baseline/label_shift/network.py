@@ -108,7 +108,7 @@ class Fitting:
     Args:
         epochs: number of passes over all crops.
         batch_size: largest number of crops in a step.
-        learning_rate: peak learning rate of AdamW, in one cycle.
+        learning_rate: peak learning rate of AdamW, with a one-cycle schedule.
         weight_decay: decoupled weight decay.
     """
 

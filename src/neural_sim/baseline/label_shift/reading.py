@@ -34,7 +34,7 @@ NEVER = -1e3
 BEYOND_ALL = 0.995
 """Limit of ``strange`` if psi has lights only: all boxes share one light, so either all of them are strange or none."""
 CALIBRATIONS = 20
-"""Number of bootstrap samples of the held-out renders; the scatter of their calibrations shows how far one may err."""
+"""Number of bootstrap samples of the held-out renders, whose calibrations scatter by a calibration's error."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Reader:
     def read(
         self, label: int, name: str, psi: Float[Tensor, "K"], groups: Mapping[str, Bins]
     ) -> tuple[list[FactorEstimate], Float[Tensor, "K"]]:
-        """Return the estimates of an object's factors, and its psi with the factors that move replaced."""
+        """Return the estimates of an object's factors, and its psi, in which estimates replace factors that move."""
         object_ = self._object(label, name, psi, groups)
         found, new = object_.found(), dict(object_.psi)
         for one in found:

@@ -1,4 +1,4 @@
-"""Settings of the estimate by label shift, which is a method of its own or the psi loop's first step."""
+"""Settings of the label-shift estimate, which is a method of its own or the psi loop's first step."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ class LabelShift:
         per_bin: number of renders of every bin and object, if the scene has no pool of them yet.
         held_out: fraction of the renders that is held out from training, for calibration and tests.
         compositions: average number of images that show each render, on different backgrounds.
-        backgrounds: number of backgrounds from which these images choose.
+        backgrounds: number of different backgrounds, from which each image gets one at random.
         fitting: how the classifier is trained.
         augmentation: random changes of the crops on which it is trained.
         prior: number of boxes that the Dirichlet prior adds to every bin.
-        level: significance level of the test whether the target differs from the present psi: the fraction of objects
-            already at their target that move by chance.
+        level: significance level of the test of whether the target differs from the present psi: the fraction of
+            objects already at their target that move by chance.
         draws: number of draws for the bootstrap of the test and, for lights, for the intervals.
         interval: coverage probability of the intervals.
         strange: largest probability that a box looks less like the renders than a held-out render does; above it, the
             object's psi does not move. If psi has lights only, the limit is ``reading.BEYOND_ALL`` instead.
-        doubt: largest expected total variation between an estimate and the target's distribution with which the
-            estimate is final. Above it, psi moves only if ``nearer`` allows that.
-        nearer: largest ratio of that total variation to the same of the present psi with which psi moves to an estimate
-            that is not final: in the psi loop, the object still takes steps along derivatives afterwards.
+        doubt: an estimate is final if its expected total variation from the target's distribution is at most this.
+        nearer: psi moves to an estimate that is not final only if its expected total variation from the target is at
+            most this fraction of the present psi's. In the psi loop, the object then still takes steps along
+            derivatives.
         skill: smallest accuracy on held-out renders, on a scale from 0 (chance) to 1; below it, psi does not move.
         fewest: smallest number of an object's boxes with which its psi may move.
         name: name in reports.
