@@ -15,6 +15,7 @@ from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import Response, ResponseLoop, agreement, centred_cosine, response
 from neural_sim.outer.steps import LearnedObjects
+from neural_sim.parameter.bins import closing
 
 PSI = torch.tensor([[0.5, 0.0, -0.5, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 
@@ -93,6 +94,18 @@ def test_agreement_is_one_with_the_derivative_itself_and_minus_one_against_it(lo
     assert agreement(slopes, PSI, told(2.0), loop.objects) == pytest.approx(1.0)
     assert agreement(slopes, PSI, told(-1.0), second) == pytest.approx(-1.0)
     assert agreement(slopes, PSI, told(0.0), loop.objects) is None
+
+
+def test_agreement_includes_objects_with_closed_bins(loop):
+    """A bin that is never drawn has no part in it: a derivative that is right elsewhere agrees, its opposite does not."""
+    inner, closed = loop.inner, torch.tensor([[False, True, False, False], [False] * 4])
+    psi = closing(PSI, closed)
+    scores = torch.rand(2, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    slopes = response(linear(inner, scores), psi, loop.numbers).slopes(inner, psi)
+    first = LearnedObjects(["a"], [0], inner.scene.distribution)
+    for sign in (1.0, -1.0):
+        told = SimpleNamespace(gradients=dict(zip(inner.scene.names, sign * slopes, strict=True)))
+        assert agreement(slopes, psi, told, first) == pytest.approx(sign)
 
 
 def test_its_loop_climbs_to_the_best_bins(scene):

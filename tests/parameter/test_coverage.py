@@ -77,3 +77,13 @@ def test_what_is_not_covered_is_left_out_of_every_psi():
     below = coverages(plain, {"pot": directions([180.0], [0.0]).numpy()}, 1.0)
     with pytest.raises(ValueError, match=r"parameter\.pose: no bin of pot is near a photograph"):
         plain.leaving_out(below)
+
+
+@pytest.mark.parametrize("which", ["initial", "target"])
+def test_a_distribution_that_is_all_in_closed_bins_is_refused(which):
+    """The photographs are from above; what is left of the distribution would be nothing, and psi not a number."""
+    plain = SceneDistribution.of([Pose(biased={"pot": {which: [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]}})])
+    ring = torch.arange(0.0, 360.0, 20.0).tolist()
+    found = coverages(plain, {"pot": directions([40.0] * len(ring), ring).numpy()}, 30.0)
+    with pytest.raises(ValueError, match=rf"parameter\.pose\.{which} of pot: want bins that photographs show"):
+        plain.leaving_out(found)

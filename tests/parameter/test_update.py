@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from neural_sim.parameter import bins as binned
 from neural_sim.parameter.update import SGD, Mirror, UpdateState, bound, shrinkage
 
 
@@ -147,3 +148,22 @@ def test_mirror_goes_on_after_a_cliff():
         if step == 45:  # momentum has forgotten the cliff: 1e12 * 0.5^40 = 1
             before = psi.clone()
     assert (psi - before)[0, 0] > 13 * 0.3 / 10
+
+
+def test_a_mirror_step_of_an_object_with_closed_bins_is_that_without_them():
+    """The other object, which has none, steps as well."""
+    p = torch.tensor([[0.0, 0.6, 0.4, 0.0], [0.1, 0.2, 0.3, 0.4]], dtype=torch.float64)
+    closed = p == 0.0
+    psi = binned.logits(p, 0.0, closed)
+    slope = torch.tensor([[9.0, 0.5, -0.5, 9.0], [0.3, -0.2, 0.9, 0.0]], dtype=torch.float64)
+    gradient = p * (slope - (p * slope).sum(-1, keepdim=True))
+    update = Mirror(learning_rate=0.1, momentum=0.0)
+    moved, state = update.step(
+        psi, binned.log_slopes(psi), gradient, torch.zeros_like(psi), UpdateState.zeros(psi)
+    )
+    assert state.refused == 0 and torch.equal(binned.is_closed(moved), closed)
+    new = binned.log_probabilities(moved).exp()
+    centred = slope[1] - slope[1].mean()
+    eta = 0.1 / math.sqrt((0.5 + centred.square().sum()) / 8.0)
+    expected = p * torch.exp(-eta * torch.where(closed, 0.0, slope))
+    torch.testing.assert_close(new, expected / expected.sum(-1, keepdim=True))

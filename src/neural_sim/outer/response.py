@@ -116,7 +116,9 @@ def agreement(
         gradient = distribution.split(result.gradients[name])
         for factor in distribution.factors:
             scale = factor.log_slopes(distribution.split(psi[label])[factor.name]).exp()
-            cosines.append(centred_cosine(gradient[factor.name] / scale, truth[factor.name][label] / scale))
+            drawn = scale > 0.0  # closed bins have no derivative by p
+            pair = (values[drawn] / scale[drawn] for values in (gradient[factor.name], truth[factor.name][label]))
+            cosines.append(centred_cosine(*pair))
     known = [cosine for cosine in cosines if not math.isnan(cosine)]
     return sum(known) / len(known) if known else None
 

@@ -186,6 +186,13 @@ class BinnedFactor:
         for name in (*(self.configured.biased or {}), ""):  # "": objects that are not named
             for which in ("initial", "target"):
                 self.probabilities(which, name)
+        for name in self.configured.closed or {}:
+            for which in ("initial", "target"):
+                if not bool(self.probabilities(which, name)[~self.closed(name)].any()):
+                    raise ValueError(
+                        f"{where}.{which} of {name}: want bins that photographs show, got a distribution that is all "
+                        "in other bins; change it, or set parameter.pose.uncovered=render"
+                    )
 
     @property
     def drawn(self) -> dict[str, Any]:

@@ -122,8 +122,10 @@ class Mirror:
         """Compute psi after one step, and the state to pass to the next."""
         steps, rest = state.steps + 1, 1 - self.momentum
         p = log_p.exp()
-        direction = gradient / p
-        direction = direction - direction.mean(-1, keepdim=True)
+        drawn = p > 0.0  # closed bins have neither p nor a gradient, and do not move
+        direction = torch.where(drawn, gradient / p, 0.0)
+        mean = direction.sum(-1, keepdim=True) / drawn.sum(-1, keepdim=True)
+        direction = torch.where(drawn, direction - mean, 0.0)
         clip = self._clip_factor(direction, state)
         velocity = self.momentum * state.first + rest * clip * direction
         noise = self.momentum**2 * state.noise + (rest * clip * standard_error / p).square()
