@@ -97,7 +97,7 @@ def test_agreement_is_one_with_the_derivative_itself_and_minus_one_against_it(lo
 
 
 def test_agreement_includes_objects_with_closed_bins(loop):
-    """A bin that is never drawn has no part in it: a derivative that is right elsewhere agrees, its opposite does not."""
+    """A bin that is never drawn has no part in it: a derivative agrees if it is right elsewhere, its opposite not."""
     inner, closed = loop.inner, torch.tensor([[False, True, False, False], [False] * 4])
     psi = closing(PSI, closed)
     scores = torch.rand(2, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -85,5 +85,7 @@ def test_a_distribution_that_is_all_in_closed_bins_is_refused(which):
     plain = SceneDistribution.of([Pose(biased={"pot": {which: [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]}})])
     ring = torch.arange(0.0, 360.0, 20.0).tolist()
     found = coverages(plain, {"pot": directions([40.0] * len(ring), ring).numpy()}, 30.0)
-    with pytest.raises(ValueError, match=rf"parameter\.pose\.{which} of pot: want bins that photographs show"):
+    with pytest.raises(
+        ValueError, match=rf"parameter\.pose\.{which} of pot: want bins that photographs show"
+    ):
         plain.leaving_out(found)

@@ -117,7 +117,9 @@ def agreement(
         for factor in distribution.factors:
             scale = factor.log_slopes(distribution.split(psi[label])[factor.name]).exp()
             drawn = scale > 0.0  # closed bins have no derivative by p
-            pair = (values[drawn] / scale[drawn] for values in (gradient[factor.name], truth[factor.name][label]))
+            pair = (
+                values[drawn] / scale[drawn] for values in (gradient[factor.name], truth[factor.name][label])
+            )
             cosines.append(centred_cosine(*pair))
     known = [cosine for cosine in cosines if not math.isnan(cosine)]
     return sum(known) / len(known) if known else None

@@ -348,3 +348,25 @@ def test_weights_of_lights_are_read_in_the_same_interface(seed):
     assert lamp.finding == "moves" and torch.tensor(lamp.p) == pytest.approx(truth.tolist(), abs=0.03)
     assert cup.finding != "moves" and cup.p_value > 0.05
     torch.testing.assert_close(result.psi[0], torch.tensor(lamp.p, dtype=torch.float64))
+    assert "the lamp under light 1 (0." in lamp.sentence
+
+
+@pytest.mark.parametrize("parameter", [Pose(bins=4), Illumination(anchors=3)])
+def test_an_object_that_no_render_shows_stays(parameter):
+    distribution, generator = SceneDistribution.of([parameter]), torch.Generator().manual_seed(0)
+    weights = torch.rand(24, 3, generator=generator)
+    subjects = [
+        painted(n, distribution) if distribution.binned else lit(n, distribution, weights) for n in COLOURS
+    ]
+    camera, synthesizer = PinholeCamera(SIDE, SIDE, 0.7), Synthesizer(ProceduralClutter())
+    scene, psi = (
+        Scene(tuple(subjects), camera, synthesizer, distribution),
+        distribution.uniform.expand(2, -1),
+    )
+    seen = scene.training_set(psi, 20, generator).images
+    empty = replace(subjects[0], maps=torch.zeros_like(subjects[0].maps))
+    settings = replace(SETTINGS, fitting=Fitting(epochs=1), draws=19)
+    result = estimate(replace(scene, subjects=(empty, subjects[1])), seen, psi, settings, generator)
+    lamp = result.factors[0]
+    assert lamp.finding == "fits no render" and lamp.accuracy == 0.0 and lamp.boxes == 20
+    torch.testing.assert_close(result.psi[0], psi[0].double())

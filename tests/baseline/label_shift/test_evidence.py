@@ -43,7 +43,7 @@ def test_a_sentence_names_groups_with_the_interval_of_their_sum():
     [
         ("stays", "psi stays, because it may be right already (p = 0.005)"),
         ("uncertain", "may be off by 0.40 in total variation), so psi stays"),
-        ("too few boxes", "40 boxes are too few to estimate its pose"),
+        ("too few boxes", "too few boxes (40) to estimate its pose"),
         ("fits no render", "do not look like its renders (a box is stranger than a held-out render in 5%"),
         ("not told apart", "from renders (90% of held-out ones are recognised, 0% by chance), so psi stays"),
     ],
@@ -58,6 +58,14 @@ def test_an_estimate_that_is_only_nearer_says_how_far_off_both_may_be():
         "your target shows the mug in pose bins 1/3 (0.80 to 1.00); the estimate may be off by 0.40 in total "
         "variation, but psi is off by 0.86"
     )
+
+
+def test_lights_are_not_called_bins():
+    lit = dataclasses.replace(MOVES, factor="illumination", groups=((1,), (2,), (3,), (4,)), lights=True)
+    assert lit.sentence == "your target shows the mug under light 1 (0.40 to 0.50), light 3 (0.40 to 0.50)"
+    assert estimates_of([dataclasses.asdict(lit)]) == (lit,)
+    unread = dataclasses.replace(lit, finding="not told apart", accuracy=-0.1).sentence
+    assert "(weights explain 0% of the variance of guesses on held-out ones), so psi stays" in unread
 
 
 def test_a_search_that_did_not_end_is_said():

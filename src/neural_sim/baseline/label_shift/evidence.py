@@ -78,6 +78,7 @@ class FactorEstimate:
         doubt: expected total variation between the estimate and the target's distribution.
         apart: the same between the present psi and the target's distribution.
         converged: whether the search for the mixture converged, which it does not if the likelihood is flat.
+        lights: whether ``p`` are weights of lights instead of probabilities of bins.
     """
 
     name: str
@@ -96,19 +97,23 @@ class FactorEstimate:
     doubt: float = 0.0
     apart: float = 0.0
     converged: bool = True
+    lights: bool = False
 
     @property
     def sentence(self) -> str:
         """Return the finding as a sentence for the console and the pages."""
         if self.finding == "too few boxes":
-            return f"{self.name}: {self.boxes} boxes are too few to estimate its {self.factor}"
+            return f"{self.name}: too few boxes ({self.boxes}) to estimate its {self.factor}"
         if self.finding == "fits no render":
             return (
                 f"{self.name}: its boxes do not look like its renders (a box is stranger than a held-out render in "
-                f"{self.strange:.0%} of pairs, 50% if they look alike), so its {self.factor} is not estimated"
+                f"{self.strange:.0%} of pairs, 50% if they look alike), so its {self.factor} stays"
             )
         if self.finding == "not told apart":
             why = f"{self.accuracy:.0%} of held-out ones are recognised, {self.chance:.0%} by chance"
+            if self.lights:
+                explained = max(0.0, self.accuracy)
+                why = f"weights explain {explained:.0%} of the variance of guesses on held-out ones"
             if not self.converged:
                 why = f"the likelihood is flat; {why}"
             return f"{self.name}: its {self.factor} cannot be told from renders ({why}), so psi stays"
@@ -118,7 +123,7 @@ class FactorEstimate:
                 f"{self.doubt:.2f} in total variation), so psi stays"
             )
         shown = ", ".join(
-            f"{_called(group)} ({_sum(self.low, group):.2f} to {_sum(self.high, group):.2f})"
+            f"{self._called(group)} ({_sum(self.low, group):.2f} to {_sum(self.high, group):.2f})"
             for group in self._largest
         )
         ending = ""
@@ -129,7 +134,12 @@ class FactorEstimate:
                 f"; the estimate may be off by {self.doubt:.2f} in total variation, but psi is off by "
                 f"{self.apart:.2f}"
             )
-        return f"your target shows the {self.name} in {self.factor} {shown}{ending}"
+        where = "under" if self.lights else f"in {self.factor}"
+        return f"your target shows the {self.name} {where} {shown}{ending}"
+
+    def _called(self, group: Sequence[int]) -> str:
+        what = ("light" if self.lights else "bin") + ("s" if len(group) > 1 else "")
+        return f"{what} " + "/".join(str(b) for b in group)
 
     @property
     def _largest(self) -> list[tuple[int, ...]]:
@@ -161,10 +171,6 @@ def estimates_of(stored: Iterable[Mapping[str, Any]]) -> tuple[FactorEstimate, .
 
 def _sum(values: Sequence[float], group: Sequence[int]) -> float:
     return sum(values[b - 1] for b in group)
-
-
-def _called(group: Sequence[int]) -> str:
-    return ("bin " if len(group) == 1 else "bins ") + "/".join(str(b) for b in group)
 
 
 @dataclass(frozen=True)

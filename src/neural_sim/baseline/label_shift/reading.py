@@ -190,7 +190,7 @@ class _Object:
         span = read.span
         return FactorEstimate(
             self.name, factor.name, boxes, start, span.p, span.low, span.high, own, read.p_value, strange,
-            read.accuracy, finding, read.chance, span.doubt, span.apart, read.converged,
+            read.accuracy, finding, read.chance, span.doubt, span.apart, read.converged, factor.lights > 0,
         )  # fmt: skip
 
     def _binned(self) -> tuple[dict[str, _Read], Float[Tensor, "held"]]:
@@ -223,7 +223,7 @@ class _Object:
                     seen, cells, null, (held, truth), settings.prior, settings.draws, generator
                 )
             span = Span.of(best.p[i] @ within[i].T, drawn[i] @ within[i].T, p_now[i], settings.interval)
-            accuracy = float((told[i] == true[i]).double().mean())
+            accuracy = float((told[i] == true[i]).double().mean()) if len(held) else 0.0
             lengths = [len(group) for group in groups[i]]
             chance = max(lengths) / sum(lengths)
             converged = best.status is Status.CONVERGED
@@ -244,11 +244,14 @@ class _Object:
     def _light(self, factor: Factor) -> _Read:
         """Estimate the weights of the lights from the mean of all boxes' guesses."""
         settings, generator = self.reader.settings, self.reader.generator
-        response = Response.of(self.known.weights, self.held.weights.double())
         now, boxes = self.psi[factor.name].double(), len(self.seen)
         each = [[b] for b in range(1, factor.lights + 1)]
+        unread = Span.of(now, now[None], now, settings.interval)
+        if not len(self.held.cells):
+            return _Read(unread, each, 1.0, 0.0, 0.0)
+        response = Response.of(self.known.weights, self.held.weights.double())
         if not boxes:
-            return _Read(Span.of(now, now[None], now, settings.interval), each, 1.0, response.explained, 0.0)
+            return _Read(unread, each, 1.0, response.explained, 0.0)
         mean, covariance = self.seen.weights.mean(0), response.covariance(boxes, now)
 
         def weights(means: Tensor) -> Tensor:
