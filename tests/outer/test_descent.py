@@ -1,5 +1,6 @@
 """The loop of checked steps: what is trained on, under which random numbers, and what is differentiated."""
 
+import itertools
 from dataclasses import dataclass, field, replace
 
 import pytest
@@ -9,10 +10,11 @@ from small_loop import CHECKED, EVERY_STEP, small_loop
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import StratifiedEstimator
-from neural_sim.outer.certificate import Trust
+from neural_sim.outer import descent
+from neural_sim.outer.certificate import Trust, certify
 from neural_sim.outer.descent import learned_objects
 from neural_sim.outer.first_step import read_objects
-from neural_sim.outer.inner import InnerLoop, Trained
+from neural_sim.outer.inner import InnerLoop, Numbers, Trained
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
@@ -186,10 +188,12 @@ class Fake:
     psi: torch.Tensor
     p_values: tuple[float, ...] = (1e-3, 1e-3)
     given: list = field(default_factory=list)
+    seeds: list = field(default_factory=list)
     shown: tuple[FactorEstimate, ...] = SHOWN
 
     def propose(self, scene, images, psi, generator):
         self.given.append((scene, images, psi))
+        self.seeds.append(generator.initial_seed())
         return Proposal(self.psi, torch.tensor(self.p_values), images=7, shown=self.shown)
 
 
@@ -242,6 +246,14 @@ def test_a_first_step_that_is_wrong_is_taken_back_and_the_loop_goes_on(scene, mo
     assert learned.records[0].certificate and learned.records[1].verdicts
     assert len(learned.records) == len(plain.records)
     assert not torch.equal(learned.trajectory[1], learned.trajectory[0])  # the derivative's step
+
+
+def test_a_first_step_shares_no_random_numbers_with_the_trainings_that_judge_it(scene, monkeypatch):
+    module = checked_loop(scene, 2, first=(first := Fake(THERE)))
+    shared = watch(monkeypatch, Numbers, "of")
+    learn_psi(module)
+    taken = {numbers.of(purpose).initial_seed() for numbers, (purpose,), _ in list(shared)}
+    assert taken and len(first.seeds) == 1 and first.seeds[0] not in taken
 
 
 def test_a_first_step_that_finds_nothing_costs_no_training(scene):
@@ -330,6 +342,25 @@ def test_a_loop_ends_after_iterations_in_which_nothing_is_tried(scene):
     assert torch.equal(learned.last, learned.trajectory[0])
     tried = learn_psi(checked_loop(scene, 3, patience=1))
     assert len(tried.records) == 3 and tried.records[1].verdicts
+
+
+def test_iterations_in_which_nothing_is_tried_end_a_loop_only_one_after_the_other(scene, monkeypatch):
+    """In every other iteration no derivative is significant; two in a row would end the loop."""
+    levels = itertools.cycle([0.001, None])
+    monkeypatch.setattr(
+        descent, "certify", lambda *given: certify(*given[:4], Trust(level=next(levels)), *given[5:])
+    )
+    learned = learn_psi(checked_loop(scene, 5, patience=2))
+    tried = [bool(record.verdicts) for record in learned.records]
+    assert tried == [False, False, True, False, True]
+
+
+def test_the_score_after_a_rejected_step_is_not_that_of_the_psi_before_it(scene, monkeypatch):
+    module = checked_loop(scene)
+    scored_by(monkeypatch, lambda psi: -psi.any(1).double())
+    learned = learn_psi(module)
+    assert [verdict.accepted for verdict in learned.records[1].verdicts.values()] == [False, False]
+    assert all(len(stays) == 1 and set(stays[0].scores) == {0.0} for stays in module._way.stays.values())
 
 
 def test_a_loop_returns_the_best_psi_on_the_way(scene, monkeypatch):

@@ -240,6 +240,19 @@ def test_what_others_lose_counts_beyond_the_error_of_the_sum():
         assert verdicts["a"].accepted == kept
 
 
+@pytest.mark.parametrize(("fall", "kept"), [(0.4, True), (0.6, False)])
+def test_what_classes_win_and_lose_in_the_same_images_is_no_error_of_the_sum(fall, kept):
+    """Two classes change by turns, so that their sum, a gain of 0.5, has no error; another class falls."""
+    gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
+    steps, _ = proposed(
+        steps_at(torch.zeros(2, 4, dtype=torch.float64)), gradient, torch.full_like(gradient, 1e-4)
+    )
+    turns = 0.3 * scattering()
+    after = torch.stack([turns + 0.2 / 50, 0.3 / 50 - turns, torch.full_like(turns, -fall / 50)])
+    _, verdicts = steps.judge(torch.zeros(3, 50), after)
+    assert [verdict.accepted for verdict in verdicts.values()] == [kept, kept]
+
+
 @pytest.mark.parametrize(("fall", "kept"), [(0.17, True), (0.18, False)])
 def test_trainings_scatter_in_every_class_adds_to_the_error_of_the_sum(fall, kept):
     """Between trainings each of the three classes scatters by 0.1, and their sum by 0.1 sqrt(3) = 0.173."""

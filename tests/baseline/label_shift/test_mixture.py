@@ -148,14 +148,14 @@ def test_known_boxes_stand_for_the_null_however_many_of_them_each_cell_has():
     Rounding decides whether a draw of the same counts is a tie, so the p-value lies between the two exact tails.
     """
     sure, known = torch.eye(2, dtype=torch.float64), torch.tensor([0] * 90 + [1] * 10)
-    even, draws = torch.tensor([0.5, 0.5], dtype=torch.float64), 999
+    even, draws = torch.tensor([0.5, 0.5], dtype=torch.float64), 9999
     found = ratio_test(
         sure[[0] * 15 + [1] * 5], Cells((2,)), {0: even}, (sure[known], known), 0.3, draws,
         torch.Generator().manual_seed(0),
     )  # fmt: skip
     beyond, at_least = (2 * binom.sf(count, 20, 0.5) for count in (15, 14))
-    error = 4 * math.sqrt(at_least / draws)
-    assert beyond - error < found < at_least + error + 1 / draws
+    assert found > beyond - 4 * math.sqrt(beyond / draws)
+    assert found < at_least + 4 * math.sqrt(at_least / draws) + 1 / draws
 
 
 def test_the_log_likelihood_is_that_of_every_box():
