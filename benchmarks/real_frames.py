@@ -72,7 +72,7 @@ def context_for(options: argparse.Namespace, names: list[str], rho: int) -> Cont
         "+experiment=ycb_video_full", "baseline=label_shift", "progress=false", f"seed={options.seed}",
         f"paths.data={options.shared}", f"objects.names=[{','.join(names)}]", f"unlearned.rho_deg=[-{rho},{rho}]",
         "parameter.pose.biased=null", "training.real.mode=none", "target.train_fraction=null",
-        f"paths.store={options.out / 'store'}",
+        f"paths.store={options.out / 'store'}", f"baseline.per_bin={options.per_bin}",
     ]  # fmt: skip
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         return context_of(compose("config", overrides), options.out)[0]
@@ -190,6 +190,7 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=Path("../shared"))
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/real_frames"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--per-bin", type=int, default=48)
     parser.add_argument("--fewest", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES), metavar="CASE")
