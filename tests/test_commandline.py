@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from documented import commands
 
-from neural_sim.commandline import FOLDERS, OWN_WORDS, checked, explained, layout_of
+from neural_sim.commandline import FOLDERS, OWN_WORDS, checked, explained, layout_of, present
 from neural_sim.configuration import UserError, conf_directory
 from neural_sim.guide import VERBS, answer, spoken
 
@@ -61,8 +61,11 @@ def test_a_key_that_is_not_there_is_explained(key, said):
 
 @pytest.mark.parametrize(
     "typed",
-    ["outer.iteration=3", "objects.root=/data", "stages=[train]", "objects=photos objects.root=/nowhere"],
-)
+    [
+        "outer.iteration=3", "objects.root=/data", "stages=[train]", "objects=photos objects.root=/nowhere",
+        "outer.iterations=0", "stages=[export] export.width=640", "stages=[predict]",
+    ],
+)  # fmt: skip
 def test_nothing_of_hydras_reaches_the_user_and_it_takes_no_more_than_three_seconds(typed):
     begun = os.times()
     clock = time.perf_counter()
@@ -77,6 +80,13 @@ def test_nothing_of_hydras_reaches_the_user_and_it_takes_no_more_than_three_seco
     assert done.returncode == 2 and not done.stdout
     assert done.stderr.startswith("neural-sim: ") and done.stderr.count("\n") == 1
     assert min(used, time.perf_counter() - clock) < 3.0  # of the processor, where others use it too
+
+
+def test_a_task_may_get_its_path_from_elsewhere():
+    for words in (["--cfg", "job"], ["+experiment=mine"], ["--config-dir=mine"], ["predict.images=*.png"]):
+        present(["stages=[predict]", *words])
+    with pytest.raises(UserError, match=r"predict.images is not given"):
+        present(["stages=[predict]", "predict.model=null"])
 
 
 def test_all_documented_commands_are_let_through():

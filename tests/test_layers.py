@@ -8,9 +8,9 @@ import neural_sim
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = (
     "types", "alpha", "checkpoint", "digests", "documents", "interruption", "processes", "randomness", "configuration",
-    "extras", "workers", "commandline", "guide", "ranges", "cameras", "devices", "pictures", "masks", "objects",
-    "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer",
-    "report", "stages", "tasks", "studies", "main",
+    "extras", "workers", "commandline", "guide", "ranges", "declared", "cameras", "devices", "pictures", "masks",
+    "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline",
+    "outer", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 

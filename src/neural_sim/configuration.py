@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -55,6 +56,30 @@ def own_folder(wanted: Path) -> Path:
         except FileExistsError:
             number += 1
             folder = wanted.with_name(f"{wanted.name}_{number}")
+
+
+def named(overrides: Sequence[str], mode: str) -> bool:
+    """Return whether a command names its folder itself; ``mode`` is ``run`` or ``sweep``."""
+    return any(override.lstrip("+").startswith(f"hydra.{mode}.dir=") for override in overrides)
+
+
+def leave_nothing(folder: Path) -> None:
+    """Remove a refused run's folder if it holds nothing but Hydra's files, and the folders that this leaves empty."""
+    held = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != ".hydra"]
+    if any(path.suffix != ".log" or path.stat().st_size for path in held):
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    for above in list(folder.parents)[:3]:
+        try:
+            above.rmdir()
+        except OSError:  # it holds other runs
+            return
+
+
+def replaced(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
+    """Return a command's overrides, with ``choices`` in place of those of the same groups."""
+    chosen = {choice.partition("=")[0] for choice in choices}
+    return [*(o for o in overrides if o.partition("=")[0].lstrip("+") not in chosen), *choices]
 
 
 GONE: dict[str, str] = {

@@ -33,10 +33,14 @@ from neural_sim.configuration import (
     conf_directory,
     first_line,
     job_folder,
+    leave_nothing,
+    named,
     own_folder,
+    replaced,
     updated,
     view_size,
 )
+from neural_sim.declared import check_early
 from neural_sim.guide import VERBS, answer, spoken
 from neural_sim.interruption import interruptible
 from neural_sim.ranges import NonNegativeInt, PositiveFraction, PositiveInt, check
@@ -129,6 +133,10 @@ def context_of(
         UserError: as ``build``, and for an unknown entry of ``stages``.
     """
     plain = _plain(config)
+    tasks = [name for name in plain["stages"] if isinstance(plain.get(name), Mapping)]
+    parts = () if len(tasks) == len(plain["stages"]) else (*_PARTS, "parameter")
+    for name in (*tasks, *parts):
+        check_early(plain[name], name)
     from neural_sim.tasks.context import Context
     from neural_sim.tasks.walk import PHASES
 
@@ -262,22 +270,17 @@ def _with_key(message: str, node: Mapping[str, Any], where: str, inner: str) -> 
     return f"{where}: {message}" if rest == message else f"{where}.{rest}"
 
 
-def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
-    """Return a command's overrides, with ``choices`` in place of those of the same groups."""
-    chosen = {choice.partition("=")[0] for choice in choices}
-    return [*(o for o in overrides if o.partition("=")[0].lstrip("+") not in chosen), *choices]
-
-
 @hydra.main(version_base="1.3", config_path=str(conf_directory()), config_name="config")
 def _task(config: DictConfig) -> float | None:
     runtime = HydraConfig.get()
+    folder = Path(runtime.runtime.output_dir)
     # Warnings of libraries about each other's deprecations, which a user of this program cannot act on.
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*")
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
     try:
         given = list(runtime.overrides.task)
-        folder, name = Path(runtime.runtime.output_dir), runtime.job.config_name
-        context, tasks = context_of(config, folder, lambda more: hydra.compose(name, _with(given, more)))
+        name = runtime.job.config_name
+        context, tasks = context_of(config, folder, lambda more: hydra.compose(name, replaced(given, more)))
         context.command = shlex.join(["python", "-m", "src.main", *given])
         context.scale = str(runtime.runtime.choices.get("scale", ""))
         from neural_sim.tasks.walk import walk
@@ -286,6 +289,8 @@ def _task(config: DictConfig) -> float | None:
     except (ValueError, OSError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise
+        if not named(runtime.overrides.hydra, "run"):
+            leave_nothing(folder)
         _refuse(error)
     except RuntimeError as error:
         from neural_sim.tasks.context import TaskFailure
@@ -337,8 +342,7 @@ class OwnFolder(Callback):
                 config.hydra.overrides.hydra.append(f"hydra.sweep.dir='{config.hydra.sweep.dir}'")
 
     def _take(self, config: DictConfig, mode: str) -> bool:
-        key = f"hydra.{mode}.dir="
-        if any(override.lstrip("+").startswith(key) for override in config.hydra.overrides.hydra):
+        if named(config.hydra.overrides.hydra, mode):
             return False
         with read_write(config):
             config.hydra[mode].dir = str(own_folder(Path(config.hydra[mode].dir)))
