@@ -8,7 +8,9 @@ import torch
 from captures import capture
 from composing import composed
 
+from neural_sim.field.quality import POOR, Quality
 from neural_sim.main import context_of
+from neural_sim.report.page.objects import ShownObject, write_objects_page
 from neural_sim.stages.field import FittedField
 from neural_sim.tasks.walk import walk
 
@@ -56,8 +58,27 @@ def test_the_page_shows_photographs_masks_renders_and_bins(root, tmp_path, caplo
     # too few are.
     assert graph.experiment.imaging.coverage["can"]["pose"].missing == [3, 4, 5, 6, 8]
     assert page.count("no photograph near") == 5
+    asks = "The field has 18 dB or more. Do you see the object, and all of it?"
+    assert (asks in page) == (quality.psnr >= POOR) and "Photographs are dimmed where" in page
     (warning,) = (r.getMessage() for r in caplog.records if "no photograph is within" in r.getMessage())
     assert "5 of the 8 bins of parameter.pose: 3, 4, 5, 6, 8; they are left out" in warning
+
+
+def test_the_headline_says_no_more_than_the_scores(tmp_path):
+    def headline(*scores):
+        views = tuple(torch.zeros(0, 4, 4, channels, dtype=torch.uint8) for channels in (3, 1, 3))
+        shown = [
+            ShownObject(name, Quality(psnr, None, None, views, (), {}, None), False, {})
+            for name, psnr in zip("abc", scores, strict=False)
+        ]
+        page = write_objects_page("test", shown, tmp_path).read_text()
+        return re.search(r'<p class="verdict[^>]*>([^<]*)', page)[1]
+
+    assert (
+        headline(20.0, 19.0) == "Every scored field has 18 dB or more. Do you see the object, and all of it?"
+    )
+    assert headline(20.0, 17.0, 12.0) == "b, c: the field does not show the object."
+    assert headline(None) == "No field is scored."
 
 
 def test_nothing_trains_on_debris_unless_told(root, tmp_path, monkeypatch):
