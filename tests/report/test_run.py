@@ -151,7 +151,7 @@ def test_a_classification_run_says_accuracy_where_others_say_ap(results, uri, tm
     assert held["score"] == "accuracy" and held["ap"]["learned"]["accuracy"] == 0.5
     assert json.loads(write_results(results, tmp_path / "other").read_text())["score"] == "AP"
     with live(uri, found) as run:
-        run.finish(found, tmp_path / "run")
+        run.finish(found, tmp_path / "run", "It worked.")
     (tracked,) = tracking.logged_runs(uri, "pose_gap")
     metrics = MlflowClient(uri).get_run(tracked.run_id).data.metrics
     assert metrics["evaluate/learned/accuracy"] == 0.5 and metrics["evaluate/learned/accuracy_a"] == 0.6
@@ -220,6 +220,19 @@ def live(uri, results):
     return live_run(uri, config, "neural_sim", results.names, results.biased)
 
 
+def test_a_run_is_told_from_others_by_its_name_and_tags(results, uri):
+    backbone = {"architecture": "resnet18"}
+    detector = {"_target_": "neural_sim.detector.fcos.Fcos", "backbone": backbone}
+    config = {"name": "pose_gap", "seed": 3, **results.config, "detector": detector}
+    for scale, name in (("smoke", "lts seed 3 smoke"), ("quick", "lts seed 3")):
+        with live_run(uri, config, "lts", ("a", "b"), ("b",), scale=scale):
+            (found,) = (run for run in tracking.logged_runs(uri, "pose_gap") if run.status == "RUNNING")
+        held = MlflowClient(uri).get_run(found.run_id)
+        told = {key: held.data.tags[key] for key in ("scale", "detector", "objects", "biased")}
+        assert held.info.run_name == name
+        assert told == {"scale": scale, "detector": "Fcos resnet18", "objects": "a,b", "biased": "b"}
+
+
 def steps(uri, run_id, key):
     return {point.step: point.value for point in MlflowClient(uri).get_metric_history(run_id, key)}
 
@@ -227,10 +240,11 @@ def steps(uri, run_id, key):
 def test_a_run_lands_in_mlflow_with_metrics_by_step(results, uri, tmp_path):
     write_results(results, tmp_path / "run")
     with live(uri, results) as run:
-        run.finish(results, tmp_path / "run")
+        run.finish(results, tmp_path / "run", "It worked.")
     (found,) = tracking.logged_runs(uri, "pose_gap")
     held = MlflowClient(uri).get_run(found.run_id)
     assert held.info.status == "FINISHED" and held.data.tags["method"] == "neural_sim"
+    assert held.data.tags["mlflow.note.content"].startswith("It worked.\n\n`evaluate/ns` scores the detector")
     assert held.data.params["parameter.pose.bins"] == "4" and held.info.run_name == "neural_sim seed 3"
     assert held.data.metrics["evaluate/learned/ap"] == 0.5 and held.data.metrics["validation_ap"] == 0.25
     assert "evaluate/ns/ap_b" not in held.data.metrics
@@ -258,7 +272,7 @@ def test_iterations_and_stages_are_there_when_they_end_and_are_written_once(resu
         assert steps(uri, found.run_id, "seconds/field") == {0: 7.5}
         run.iterations([first, second])
         assert steps(uri, found.run_id, "psi/validation_loss") == {0: 0.5, 1: 0.25}
-        run.finish(dataclasses.replace(results, records=[first, second]), tmp_path / "run")
+        run.finish(dataclasses.replace(results, records=[first, second]), tmp_path / "run", "It worked.")
     history = MlflowClient(uri).get_metric_history(found.run_id, "psi/validation_loss")
     assert [point.value for point in history] == [0.5, 0.25]
     assert steps(uri, found.run_id, "field/a/psnr") == {0: 29.0, 1: 30.0}
@@ -272,7 +286,7 @@ def test_what_was_reached_charts_by_what_was_spent(results, uri, tmp_path):
     ]
     (tmp_path / "run").mkdir()
     with live(uri, results) as run:
-        run.finish(dataclasses.replace(results, curve=points), tmp_path / "run")
+        run.finish(dataclasses.replace(results, curve=points), tmp_path / "run", "It worked.")
     (found,) = tracking.logged_runs(uri, "pose_gap")
     for name, expected in (
         ("ap_by_iteration", {0: 0.0, 4: 0.4}),

@@ -16,6 +16,11 @@ from neural_sim.report import tracking
 from neural_sim.report.model_files import log_detector
 from neural_sim.report.run import RunResults
 
+_NAMES = (
+    "`evaluate/ns` scores the detector trained on the initial distribution, `evaluate/learned` the one trained on the "
+    "learned distribution, and `evaluate/matched` the one trained on the target's. The page `report.html` is among "
+    "the artifacts."
+)
 _COUNTED = ("validation_loss", "training_loss", "images", "detector_steps", "products", "cpu_seconds")
 
 
@@ -59,8 +64,12 @@ class LiveRun:
         """Write the run's detector as a model, see ``model_files.log_detector``."""
         return log_detector(self._run, folder, example, registered_name)
 
-    def finish(self, results: RunResults, folder: Path) -> None:
-        """Write the rest: iterations and fields from the store, final numbers, and ``folder`` as artifacts."""
+    def finish(self, results: RunResults, folder: Path, headline: str) -> None:
+        """Write the rest: iterations and fields from the store, final numbers, and ``folder`` as artifacts.
+
+        The run's description is ``headline`` and what the names of the scored detectors mean.
+        """
+        self._run.tag("mlflow.note.content", f"{headline}\n\n{_NAMES}")
         self.iterations(results.records)
         self.fields(results.fields)
         self._run.log(_final(results))
@@ -76,16 +85,26 @@ def live_run(
     names: Sequence[str],
     biased: Sequence[str],
     begun: float | None = None,
+    scale: str = "",
 ) -> Iterator[LiveRun]:
-    """Open a run with the configuration as its parameters, see ``tracking.opened``."""
+    """Open a run with the configuration as its parameters, see ``tracking.opened``.
+
+    Its name and tags tell it from others of its experiment: method, seed, scale, detector and objects.
+    """
     seed, gap = config["seed"], config.get("gap", "disjoint")
     name = f"{method} seed {seed}" + ("" if gap == "disjoint" else f" gap {gap}")
+    name += f" {scale}" if scale not in ("", "quick") else ""
+    detector = config.get("detector", {})
+    kind = str(detector.get("_target_", "")).rpartition(".")[2]
     tags = {
         "method": method,
         "seed": str(seed),
         "parameter": ",".join(config["parameter"]),
         "biased": ",".join(biased),
         "gap": gap,
+        "scale": scale,
+        "detector": f"{kind} {detector.get('backbone', {}).get('architecture', '')}".strip(),
+        "objects": ",".join(names),
     }
     with tracking.opened(uri, config["name"], name, tags, tracking.flatten(config), begun) as run:
         yield LiveRun(run, names)

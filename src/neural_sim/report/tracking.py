@@ -73,7 +73,7 @@ class Run:
 
     @property
     def where(self) -> str:
-        """How to open the run in MLflow, see the function ``where``."""
+        """How to open the run in MLflow."""
         return where(self.uri, self.experiment_id, self.run_id)
 
     def log(self, metrics: Mapping[str, float], step: int = 0) -> None:
@@ -87,9 +87,13 @@ class Run:
         now = int(1000 * self._clock())
         for key, values in series.items():
             steps = values.items() if isinstance(values, Mapping) else enumerate(values)
-            name = _allowed(key)
-            self._waiting += [Metric(name, float(v), now, step) for step, v in steps if math.isfinite(v)]
+            finite = [(step, float(v)) for step, v in steps if math.isfinite(v)]
+            self._waiting += [Metric(_allowed(key), v, now, step) for step, v in finite]
         self._try("metrics wait for the next writing", self._send)
+
+    def tag(self, key: str, text: str) -> None:
+        """Set a tag of the run."""
+        self._try(f"it has no tag {key}", lambda: self._client.set_tag(self.run_id, key, text))
 
     def log_files(self, folder: Path) -> None:
         """Copy a folder to the run's artifacts."""
@@ -124,8 +128,7 @@ class Run:
         """
         self._try("the last metrics are lost", self._send)
         if error is not None:
-            text = f"{type(error).__name__}: {error}".splitlines()[0][:500]
-            self._try("its cause is not noted", lambda: self._client.set_tag(self.run_id, "error", text))
+            self.tag("error", f"{type(error).__name__}: {error}".splitlines()[0][:500])
         self._try(f"the run stays open, want {status}", lambda: self._end(status))
 
     def parameters(self, parameters: Mapping[str, Any]) -> None:

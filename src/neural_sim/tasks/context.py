@@ -159,7 +159,8 @@ class Context:
                 yield
             return
         method, biased = self.experiment.loop.method.name, self.experiment.imaging.distribution.biased
-        with live_run(self.uri, self.config, method, self.graph.names, biased, self.begun) as self.live:
+        names = self.graph.names
+        with live_run(self.uri, self.config, method, names, biased, self.begun, self.scale) as self.live:
             _log.info("to watch this run:\n%s", self.live.where)
             yield
 

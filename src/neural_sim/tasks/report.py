@@ -64,7 +64,7 @@ class ReportTask(Task):
         page = RunPage(report, shown)
         path = page.write(commands, folder)
         print(report.summary())
-        context.live.finish(report, folder)
+        context.live.finish(report, folder, page.headline)
         print(f"results: {folder}\n{context.live.where}")
         for what, command in commands.items():
             print(f"{what.lower()}: {command}")
