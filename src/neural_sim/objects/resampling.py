@@ -86,19 +86,53 @@ def _view(
 ) -> tuple[Float[Tensor, "s s 4"], Bool[Tensor, "s s"]]:
     side = min(MOST_SAMPLES, max(1, math.ceil(pixels_per_pixel(frame, camera))))
     fine = PinholeCamera(side * camera.width, side * camera.height, camera.field_of_view)
-    pixel = torch.arange(fine.width * fine.height)
-    directions = pixel_rays(fine, turned[None], pixel).directions @ pose[:3, :3]
-    place, seen = frame.lens.project(directions)
-    size = place.new_tensor([frame.lens.width, frame.lens.height])
-    seen &= ((place >= 0.0) & (place <= size)).all(-1)
-    grid = (2.0 * place / size - 1.0).nan_to_num(2.0).float().view(1, fine.height, fine.width, 2)
-    sampled = functional.grid_sample(
-        premultiplied(photo).movedim(-1, 0)[None], grid, padding_mode="border", align_corners=False
+    top, bottom, left, right = _window(frame, pose, turned, camera)
+    height, width = side * (bottom - top), side * (right - left)
+    rows = torch.arange(side * top, side * bottom)[:, None]
+    grid, seen = _projected(
+        frame, pose, turned, fine, rows * fine.width + torch.arange(side * left, side * right)
     )
-    sampled = sampled * seen.view(1, 1, fine.height, fine.width)
+    sampled = functional.grid_sample(
+        premultiplied(photo).movedim(-1, 0)[None],
+        grid.float().view(1, height, width, 2),
+        padding_mode="border",
+        align_corners=False,
+    )
+    sampled = sampled * seen.view(1, 1, height, width)
     pooled = functional.avg_pool2d(sampled, side)[0].movedim(0, -1)
-    known = functional.avg_pool2d(seen.view(1, 1, fine.height, fine.width).float(), side)[0, 0] > 1.0 - 1e-6
+    inside = functional.avg_pool2d(seen.view(1, 1, height, width).float(), side)[0, 0] > 1.0 - 1e-6
     alpha = pooled[..., 3:]
     colour = torch.where(alpha > 1e-4, pooled[..., :3] / alpha.clamp_min(1e-4), 0.0)
     image = torch.cat([colour, torch.where(alpha > 1e-4, alpha, 0.0)], -1).clamp(0.0, 1.0)
-    return image * known[..., None], known
+    view = photo.new_zeros(camera.height, camera.width, 4)
+    known = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    view[top:bottom, left:right] = image * inside[..., None]
+    known[top:bottom, left:right] = inside
+    return view, known
+
+
+def _window(frame: Frame, pose: Tensor, turned: Tensor, camera: PinholeCamera) -> tuple[int, int, int, int]:
+    """Return first and last rows and columns of a view between which the photograph lies, with a pixel to spare.
+
+    A view that shows the whole object from nearby is many times as wide as the photograph.
+    """
+    _, seen = _projected(frame, pose, turned, camera, torch.arange(camera.width * camera.height))
+    found = seen.view(camera.height, camera.width)
+    ends = []
+    for across, size in ((1, camera.height), (0, camera.width)):
+        (lines,) = found.any(across).nonzero(as_tuple=True)
+        first, last = (int(lines[0]), int(lines[-1])) if len(lines) else (0, 0)
+        ends += [max(first - 1, 0), min(last + 2, size)]
+    top, bottom, left, right = ends
+    return top, bottom, left, right
+
+
+def _projected(
+    frame: Frame, pose: Tensor, turned: Tensor, camera: PinholeCamera, pixel: Tensor
+) -> tuple[Float[Tensor, "n 2"], Bool[Tensor, "n"]]:
+    """Return where pixels of a view lie in the photograph, from -1 to 1, and whether they lie in it."""
+    directions = pixel_rays(camera, turned[None], pixel.flatten()).directions @ pose[:3, :3]
+    place, seen = frame.lens.project(directions)
+    size = place.new_tensor([frame.lens.width, frame.lens.height])
+    seen &= ((place >= 0.0) & (place <= size)).all(-1)
+    return (2.0 * place / size - 1.0).nan_to_num(2.0), seen
