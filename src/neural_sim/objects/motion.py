@@ -119,7 +119,11 @@ class _Search:
         with (
             _quiet(pycolmap),
             tqdm(
-                total=3 * len(shots), desc=f"poses of {album.name}", disable=not self.progress, leave=False
+                total=3 * len(shots),
+                desc=f"cameras of {album.name}",
+                bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}",
+                disable=not self.progress,
+                leave=False,
             ) as bar,
         ):
             standing = standing_parts(shots)

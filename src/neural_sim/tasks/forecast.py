@@ -15,8 +15,10 @@ from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.documents import parsed_json
 from neural_sim.field.grid import GridField
+from neural_sim.field.scene.recipe import SceneMasks
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.objects.photos import Photos
 from neural_sim.outer.progress import duration
 from neural_sim.stages.cameras import CommandMasksStage, MasksStage
 from neural_sim.stages.detector import DetectorStage, TrainedStage
@@ -32,6 +34,8 @@ from neural_sim.tasks.context import Context
 
 MEASURED: dict[str, tuple[float, float]] = {
     "views": (0.8, 0.85),
+    "photographs": (0.5, 0.38),
+    "masks": (0.0, 22.5),
     "field": (1.4, 13.8),
     "target_sets": (0.5, 1.5),
     "detector": (1.5, 0.5),
@@ -44,8 +48,11 @@ MEASURED: dict[str, tuple[float, float]] = {
 }
 """CPU seconds of one thread for each kind of work, and for each million of its pixels or rays.
 
-From +experiment=pose_gap at scale=smoke (commit 0e8c613) and scale=quick (commit bf70253).
+From +experiment=pose_gap at scale=smoke (commit 0e8c613) and scale=quick (commit bf70253); photographs and masks from
+49 and 80 photographs of 1,000 pixels and 160 of 160 (commit 0642912).
 """
+OPENED = 1e5
+"""What it takes to open a photograph, in pixels of one."""
 LAYERS = 0.1
 """CPU seconds of one thread for ``_layers``, on the same machine."""
 SPREAD = (0.8, 1.4)
@@ -132,9 +139,11 @@ def _work(stage: Stage[Any]) -> list[tuple[str, float]] | None:
     """Return the kinds of work of a stage with their amounts; empty: next to nothing; None: not known."""
     if isinstance(stage, ViewsStage):
         views = stage.settings
-        number = views.count + views.held_out
-        known = stage.objects.part(stage.object).has_meshes
-        return [("views", number * views.image_size**2)] if known else None
+        if not stage.objects.part(stage.object).has_meshes:
+            return _of_photographs(stage)
+        return [("views", (views.count + views.held_out) * views.image_size**2)]
+    if isinstance(stage, MasksStage):
+        return _of_masks(stage)
     if isinstance(stage, FieldStage):
         rays = getattr(stage.recipe.fitting, "keywords", {}).get("batch_rays", 0)
         known = stage.recipe.kind is GridField and stage.views.settings.lights is None and rays > 0
@@ -148,7 +157,26 @@ def _work(stage: Stage[Any]) -> list[tuple[str, float]] | None:
         return [("symmetry", 0.0)]
     if isinstance(stage, PsiStage):
         return _of_psi(stage)
-    return None if isinstance(stage, (TrainedStage, ShownStage, MasksStage, CommandMasksStage)) else []
+    return None if isinstance(stage, (TrainedStage, ShownStage, CommandMasksStage)) else []
+
+
+def _of_photographs(stage: ViewsStage) -> list[tuple[str, float]] | None:
+    source, views = stage.objects.part(stage.object).source, stage.settings
+    if not isinstance(source, Photos) or getattr(stage.refinement, "rounds", 0) > 0:
+        return None
+    parts = source.split(stage.object, views.count, views.held_out)
+    lenses = [frame.lens for part in parts for frame in part]
+    return [("photographs", sum(lens.width * lens.height + OPENED for lens in lenses))]
+
+
+def _of_masks(stage: MasksStage) -> list[tuple[str, float]] | None:
+    """Return the rays of the scene's fit, and those of the masks that it renders."""
+    scene = stage.scene
+    if not isinstance(scene, SceneMasks):
+        return None
+    sides = [(frame.lens.width, frame.lens.height) for frame in stage.source.captures[stage.object].frames]
+    rendered = sum(scene.image_size**2 * min(side) / max(side) for side in sides)
+    return [("masks", scene.steps * scene.batch_rays + rendered)]
 
 
 def _of_target(stage: TargetSetsStage) -> list[tuple[str, float]] | None:
