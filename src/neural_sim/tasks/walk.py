@@ -177,7 +177,7 @@ def warn_of_uncovered(graph: Graph) -> None:
 
 
 def omitted(graph: Graph, learns: bool) -> list[Omission]:
-    """Return the work that a run leaves out because it is not needed, and log it.
+    """Return the work that a run leaves out because it is not needed, and write it to the log file.
 
     Args:
         graph: stages of the run.
@@ -207,5 +207,5 @@ def omitted(graph: Graph, learns: bool) -> list[Omission]:
         if applies and (learns or phase != "psi")
     ]
     for each in found:
-        _log.info("left out: %s: %s", each.what, each.why)
+        _log.debug("left out: %s: %s", each.what, each.why)
     return found
