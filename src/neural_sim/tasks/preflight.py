@@ -10,6 +10,7 @@ from typing import Any, cast
 from typing_extensions import override
 
 from neural_sim.baseline.base import HypergradientLoop, Response
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.documents import write_json
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.preflight import expected_gains, photograph_gains
@@ -78,6 +79,7 @@ class PreflightTask(Task):
             labelled=tuple(labelled),
             score=x.score,
             shown=results(graph.shown).factors,
+            follows=isinstance(outer.first_step, LabelShift),
             caution=caution(context.scale),
         )
         document = dataclasses.asdict(report) | {"verdict": report.verdict, "worth": report.worth}

@@ -35,6 +35,35 @@ def test_derivatives_count_by_the_level_over_all_of_them():
     assert preflight(0.02, 0.03, 0.04).verdict.startswith("Not worth optimising")
 
 
+def test_what_the_target_shows_is_worth_a_run_where_the_first_step_goes_there():
+    estimates = tuple(
+        FactorEstimate(
+            name,
+            "pose",
+            30,
+            (0.5, 0.5),
+            (0.9, 0.1),
+            (0.8, 0.0),
+            (1.0, 0.2),
+            ((1,), (2,)),
+            0.01,
+            0.5,
+            0.9,
+            finding,
+        )
+        for name, finding in (("drill", "moves"), ("mug", "stays"), ("can", "nearer"))
+    )
+    hopeless = dataclasses.replace(preflight(0.5), shown=estimates)
+    assert hopeless.verdict.startswith("Not worth optimising")
+    follows = dataclasses.replace(hopeless, follows=True)
+    assert follows.verdict.startswith("Worth a run: your target shows drill and can otherwise than")
+    assert follows.verdict.endswith("derivatives alone would move nothing.")
+    both = dataclasses.replace(preflight(0.001), shown=estimates, follows=True)
+    assert both.verdict.endswith("derivatives would move object 0.")
+    still = dataclasses.replace(hopeless, shown=estimates[1:2], follows=True)
+    assert still.verdict.startswith("Not worth optimising")
+
+
 def test_the_summary_has_gains_weak_bins_and_advice():
     text = preflight(0.001, 0.5).summary()
     assert "1 (+0.1000 ± 0.0100 for 15% of its images)" in text

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.baseline.label_shift.evidence import MOVING, FactorEstimate
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import write_whole
 from neural_sim.outer.preflight import ExpectedGains, PhotographGain, equivalent
@@ -42,6 +42,7 @@ class Preflight:
         labelled: gains from labelled photographs in training, by their number; empty if none are for training.
         score: the kind of score.
         shown: the estimate from the target's boxes.
+        follows: whether the loop's first step goes to this estimate.
         caution: a warning to show first; empty: none.
     """
 
@@ -56,7 +57,14 @@ class Preflight:
     labelled: tuple[PhotographGain, ...] = ()
     score: Score = "AP"
     shown: tuple[FactorEstimate, ...] = ()
+    follows: bool = False
     caution: str = ""
+
+    @property
+    def moved(self) -> list[str]:
+        """Objects that the loop's first step would move, because the target's boxes show them elsewhere than psi."""
+        moving = [one.name for one in self.shown if one.finding in MOVING]
+        return list(dict.fromkeys(moving)) if self.follows else []
 
     @property
     def promising(self) -> list[ExpectedGains]:
@@ -76,12 +84,20 @@ class Preflight:
 
     @property
     def _verdict(self) -> str:
-        if not self.promising:
+        names = list(dict.fromkeys(f.name for f in self.promising))
+        if self.moved:
+            derivatives = (
+                f"derivatives would move {listed(names)}" if names else "derivatives alone would move nothing"
+            )
+            return (
+                f"Worth a run: your target shows {listed(self.moved)} otherwise than they are rendered now. The first "
+                f"step goes there, and stays if a training is better for it; {derivatives}."
+            )
+        if not names:
             return (
                 "Not worth optimising as it is configured: no object's derivative can be distinguished from zero, so "
                 "the loop would not know where to go."
             )
-        names = list(dict.fromkeys(f.name for f in self.promising))
         return (
             f"Worth optimising: {listed(names)} would gain. A first step of the trust region lowers the outer loss by "
             f"{self.gain:.3f} to first order."
