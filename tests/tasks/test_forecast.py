@@ -50,6 +50,7 @@ def test_what_was_never_measured_is_named(tmp_path):
         "; not counting warm_start, psi, evaluate, unknown before a first run"
     )
     assert said(tmp_path, "detector=fcos", "stages=[evaluate]", "field=mlp").startswith(": about ")
+    assert said(tmp_path, "stages=[preflight]").endswith("preflight, unknown until a first run")
     assert said(tmp_path, "workers=2") == ""
 
 

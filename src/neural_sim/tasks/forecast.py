@@ -55,6 +55,8 @@ OPENED = 1e5
 """What it takes to open a photograph, in pixels of one."""
 LAYERS = 0.1
 """CPU seconds of one thread for ``_layers``, on the same machine."""
+QUICK = ("sample", "viewer", "box")
+"""Tasks that take no time of their own: they write or show what stages made."""
 SPREAD = (0.8, 1.4)
 """What a run may take, as fractions of what is expected."""
 MILLION = 1e6
@@ -100,6 +102,8 @@ def _by_costs(context: Context, missing: Sequence[Stage[Any]]) -> str:
             unknown[stage.phase] = None
         else:
             spent[stage.phase] = spent.get(stage.phase, 0.0) + seconds
+    tasks = [name for name in context.stages if "_target_" in (context.config.get(name) or {})]
+    unknown |= dict.fromkeys(name for name in tasks if name not in QUICK)
     if "report" in context.stages:
         spent["report"] = spent.get("report", 0.0) + MEASURED["report"][0]
     spent = {phase: seconds for phase, seconds in spent.items() if seconds and phase not in unknown}

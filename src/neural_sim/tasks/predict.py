@@ -95,7 +95,8 @@ class PredictTask(Task):
             print(scores_table(ap, len(scored)))
             if (why := worthless(ap, [found for found, _ in scored])) is not None:
                 _log.warning("predict: the score says nothing: %s", why)
-        print(f"{len(rows)} detections in {len(entries)} pictures\nresults: {folder}")
+        drawn = sum(row["score"] >= self.draw_above for row in rows)
+        print(f"{len(rows)} detections in {len(entries)} pictures, {drawn} drawn\nresults: {folder}")
 
     def _saved(self, context: Context) -> SavedDetector:
         folder, kind = context.folder, context.config["detector"]["_target_"]
