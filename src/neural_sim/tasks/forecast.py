@@ -15,7 +15,6 @@ from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.documents import parsed_json
 from neural_sim.field.grid import GridField
-from neural_sim.field.scene.recipe import SceneMasks
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.objects.photos import Photos
@@ -175,6 +174,8 @@ def _of_photographs(stage: ViewsStage) -> list[tuple[str, float]] | None:
 
 def _of_masks(stage: MasksStage) -> list[tuple[str, float]] | None:
     """Return the rays of the scene's fit, and those of the masks that it renders."""
+    from neural_sim.field.scene.recipe import SceneMasks  # only runs on photographs load it
+
     scene = stage.scene
     if not isinstance(scene, SceneMasks):
         return None
