@@ -50,7 +50,7 @@ def test_what_was_never_measured_is_named(tmp_path):
         "; not counting warm_start, psi, evaluate, unknown before a first run"
     )
     assert said(tmp_path, "detector=fcos", "stages=[evaluate]", "field=mlp").startswith(": about ")
-    assert said(tmp_path, "stages=[preflight]").endswith("preflight, unknown until a first run")
+    assert said(tmp_path, "stages=[preflight]").endswith("preflight, unknown before a first run")
     assert said(tmp_path, "workers=2") == ""
 
 
@@ -68,7 +68,9 @@ def test_photographs_and_their_masks_are_told_too(tmp_path):
     # 0.5 s, and 0.38 for each million of pixels, 1e5 more for each photograph; then 22.5 for each million of rays.
     assert "(views 1 s, field 15 s)" in of_photographs()
     assert "(views 17 s, field 15 s)" in of_photographs("objects.masks=scene")
-    assert of_photographs("objects.refinement.rounds=6").endswith("without views, unknown until a first run")
+    assert of_photographs("objects.refinement.rounds=6").endswith(
+        "not counting views, unknown before a first run"
+    )
 
 
 def test_fewer_iterations_and_images_take_less(tmp_path):

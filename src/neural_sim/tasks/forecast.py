@@ -101,7 +101,8 @@ def _by_costs(context: Context, missing: Sequence[Stage[Any]]) -> str:
             unknown[stage.phase] = None
         else:
             spent[stage.phase] = spent.get(stage.phase, 0.0) + seconds
-    tasks = [name for name in context.stages if "_target_" in (context.config.get(name) or {})]
+    made = {name: (context.config.get(name) or {}).get("_target_", "") for name in context.stages}
+    tasks = [name for name, target in made.items() if target.startswith("neural_sim.tasks.")]
     unknown |= dict.fromkeys(name for name in tasks if name not in QUICK)
     if "report" in context.stages:
         spent["report"] = spent.get("report", 0.0) + MEASURED["report"][0]
