@@ -79,8 +79,8 @@ def test_points_lie_on_the_surface_in_its_colour(shots):
 def test_pictures_show_the_object_before_grey_and_boxes_from_the_threshold_on(shots):
     draw = shots.draw(90.0, 0.0, 4.0)
     bare = shots.picture(0, draw, above=1.01)
-    assert bare.shape == (32, 32, 3) and bare.dtype == np.uint8
-    assert bare[0, 0].tolist() == [round(255 * GREY)] * 3 and bare[16, 16, 0] > 220 > 60 > bare[16, 16, 1]
+    assert bare.shape == (288, 288, 3) and bare.dtype == np.uint8
+    assert bare[0, 0].tolist() == [round(255 * GREY)] * 3 and bare[144, 144, 0] > 220 > 60 > bare[144, 144, 1]
     boxed = shots.picture(0, draw, above=0.05)
     assert not np.array_equal(boxed, bare)
 
@@ -112,7 +112,7 @@ def test_controls_change_what_is_shown(viewer):
     assert not np.array_equal(viewer.image.image, before)
     viewer.object.value = "black"
     viewer.show_object()
-    assert viewer.label == 1 and viewer.image.image[16, 16].max() < 60
+    assert viewer.label == 1 and viewer.image.image[144, 144].max() < 60
     assert len(viewer.frustums) == 4 * PER_BIN
     viewer.factor.value = "zoom"
     viewer.show_object()

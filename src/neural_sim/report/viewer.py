@@ -26,6 +26,8 @@ from neural_sim.types import PinholeCamera, SceneDraw
 
 GREY = 0.5
 """Grey level of the background of renders."""
+WIDE = 280
+"""Smallest width of renders on the page, in pixels; captions of boxes need it."""
 PER_BIN = 4
 """Number of cameras shown for each bin."""
 
@@ -77,18 +79,20 @@ class Shots:
 
     @torch.no_grad()
     def picture(self, label: int, draw: SceneDraw, above: float = 0.3) -> UInt8[np.ndarray, "height width 3"]:
-        """Render the object on grey, with the detector's boxes whose score is at least ``above``."""
+        """Render the object on grey, enlarged, with the detector's boxes whose score is at least ``above``."""
         shown = self.scene.render(label, draw)
         behind = torch.full_like(shown.rgb, GREY).movedim(-1, 1)
         image = composite(shown.rgb, shown.opacity, behind).clamp(0.0, 1.0)
         (detections,) = self.detector.predict(self.params, image)
         sure = (detections["scores"] >= above).cpu()
+        times = -(-WIDE // image.shape[-1])
         pixels = image[0].mul(255.0).round().to(torch.uint8).cpu()
+        pixels = pixels.repeat_interleave(times, 1).repeat_interleave(times, 2)
         if sure.any():
-            boxes, scores = detections["boxes"].cpu()[sure], detections["scores"].cpu()[sure]
+            boxes, scores = times * detections["boxes"].cpu()[sure], detections["scores"].cpu()[sure]
             names = [self.scene.names[int(i)] for i in detections["labels"].cpu()[sure]]
             written = [f"{name} {score:.2f}" for name, score in zip(names, scores.tolist(), strict=True)]
-            pixels = draw_bounding_boxes(pixels, boxes, written, colors="#e69f00")
+            pixels = draw_bounding_boxes(pixels, boxes, written, colors="#e69f00", width=2)
         return pixels.movedim(0, -1).numpy()
 
     @torch.no_grad()
