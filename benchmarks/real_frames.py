@@ -119,7 +119,7 @@ def upright(target: YcbVideoTarget, graph: Graph) -> LabelledImages:
     return padded(torch.stack(images), boxes)
 
 
-def near(told: Tensor, true: Tensor, groups: list[list[int]], bins: int, most: int) -> Tensor:
+def near(told: Tensor, true: Tensor, groups: Sequence[Sequence[int]], bins: int, most: int) -> Tensor:
     """Return which bins are at most ``most`` steps from one that looks like the true one."""
     alike = torch.eye(bins, dtype=torch.bool)
     for group in groups:
@@ -132,7 +132,7 @@ def near(told: Tensor, true: Tensor, groups: list[list[int]], bins: int, most: i
 
 
 def read(
-    reader: Reader, truth: Tensor, label: int, name: str, psi: Tensor, groups: list[list[int]]
+    reader: Reader, truth: Tensor, label: int, name: str, psi: Tensor, groups: Sequence[Sequence[int]]
 ) -> dict[str, Any]:
     """Return how well an object's boxes and held-out renders were read, and what was made of it."""
     seen, held, cells = reader.posteriors(label, psi)

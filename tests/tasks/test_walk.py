@@ -5,6 +5,7 @@ import logging
 import re
 import shutil
 import signal
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,7 +22,7 @@ from neural_sim.report.run_tracking import LiveRun
 from neural_sim.report.tracking import tracking_uri
 from neural_sim.stages.target_sets import TargetSets
 from neural_sim.synthesis.export.coco import write_coco
-from neural_sim.tasks.walk import walk
+from neural_sim.tasks.walk import walk, warn_of_misreading
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",
@@ -297,3 +298,16 @@ def test_a_run_that_fails_or_is_interrupted_says_so(folder, returned, uri, monke
             walk(*_context(folder, *WHOLE, "seed=2", "resume=false"))
         assert _seen(uri)[0].status == status
     assert signal.getsignal(signal.SIGINT) == handler
+
+
+def test_an_estimate_from_photographs_comes_with_a_warning(tmp_path, caplog):
+    said = {}
+    for method in ("neural_sim", "label_shift", "neural_sim_derivative", "ns"):
+        context, _ = context_of(composed(*SMALL, f"baseline={method}"), tmp_path / "run")
+        for rendered in (True, False):
+            caplog.clear()
+            warn_of_misreading(SimpleNamespace(experiment=context.experiment, renders_target=rendered))
+            said[method, rendered] = caplog.text
+    assert [each for each, text in said.items() if text] == [("neural_sim", False), ("label_shift", False)]
+    assert "a training judges the estimate" in said["neural_sim", False]
+    assert "no training judges the estimate with baseline=label_shift" in said["label_shift", False]

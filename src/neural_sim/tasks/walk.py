@@ -134,6 +134,8 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
     phases = PHASES.keys() & tasks.keys()
     if phases:
         warn_of_uncovered(context.graph)
+    if {"psi", "evaluate", "report"} & phases:
+        warn_of_misreading(context.graph)
     wanted = [stage for task in tasks.values() for stage in task.reads(context)]
     if wanted:
         missing = [stage for stage in context.results.check(wanted) if stage.stored]
@@ -174,6 +176,21 @@ def warn_of_uncovered(graph: Graph) -> None:
                     "they are left out, parameter.pose.uncovered=render keeps them" if out
                     else "they are rendered, and may show debris",
                 )  # fmt: skip
+
+
+def warn_of_misreading(graph: Graph) -> None:
+    """Warn where psi is estimated from photographs: those whose bins are known were mostly misread."""
+    method, outer = graph.experiment.loop.method, graph.experiment.loop.outer
+    alone = isinstance(method, LabelShift)
+    first = isinstance(method, HypergradientLoop) and isinstance(outer.first_step, LabelShift)
+    if graph.renders_target or not (alone or first):
+        return
+    _log.warning(
+        "what your photographs show is estimated, and may be wrong: where the bins were known, photographs were mostly "
+        "misread (docs/results.md, On real frames); %s",
+        f"no training judges the estimate with baseline={method.name}, baseline=neural_sim does" if alone
+        else "a training judges the estimate; compare its scores with those before",
+    )  # fmt: skip
 
 
 def omitted(graph: Graph, learns: bool) -> list[Omission]:
