@@ -8,7 +8,8 @@ import torch
 from composing import composed
 from PIL import Image
 
-from neural_sim.main import UserError, _with, context_of
+from neural_sim.configuration import replaced
+from neural_sim.main import UserError, context_of
 from neural_sim.stages.reconstruction import ReconstructionStage
 from neural_sim.stages.scene import LoadedImagesStage, MeshSubjectStage
 from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
@@ -21,7 +22,7 @@ def command(*overrides):
     """Of a command, with its other methods."""
 
     def again(more=()):
-        return composed(*_with(["scale=smoke", *overrides], more))
+        return composed(*replaced(["scale=smoke", *overrides], more))
 
     return context_of(again(), Path("unused"), again)
 
@@ -82,7 +83,7 @@ def test_another_method_is_what_its_own_command_would_compose():
 
 def test_choices_take_the_place_of_those_of_the_same_group():
     given = ["+experiment=pose_gap", "baseline=ns", "+baseline.part=1", "seed=2"]
-    assert _with(given, ["baseline=lts"]) == [
+    assert replaced(given, ["baseline=lts"]) == [
         "+experiment=pose_gap",
         "+baseline.part=1",
         "seed=2",
