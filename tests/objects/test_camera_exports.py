@@ -93,7 +93,7 @@ def colmap_text(
 
 
 def with_other_models(home: Path) -> None:
-    """As nerfstudio, instant-ngp and 3D Gaussian splatting leave it: their models next to the photographs."""
+    """Write models next to the photographs, as nerfstudio, instant-ngp and 3D Gaussian splatting do."""
     written(home, LENS, {}, name="images/frame_{:05d}.png")
     photographs(home / "images_2", [f"frame_{n:05d}.png" for n in range(COUNT)])
     for model in ("colmap/sparse/0", "colmap_text", "distorted/sparse/0"):

@@ -100,7 +100,7 @@ def test_little_memory_is_a_note(tmp_path, monkeypatch):
 
 
 def test_cached_files_of_a_container_count_as_free(tmp_path):
-    """Of a limit of 8 GiB, 7 are in use, 5 of them for files that were read."""
+    """The container may use 8 GiB and uses 7; the kernel can give 5 of these back, because they only cache files."""
     gib = 2**30
     group = tmp_path / "sys/fs/cgroup"
     group.mkdir(parents=True)

@@ -116,7 +116,7 @@ def agreement(
         gradient = distribution.split(result.gradients[name])
         for factor in distribution.factors:
             scale = factor.log_slopes(distribution.split(psi[label])[factor.name]).exp()
-            drawn = scale > 0.0  # closed bins have no derivative by p
+            drawn = scale > 0.0  # closed bins have no derivative with respect to p
             pair = (
                 values[drawn] / scale[drawn] for values in (gradient[factor.name], truth[factor.name][label])
             )

@@ -51,7 +51,7 @@ From +experiment=pose_gap at scale=smoke (commit 0e8c613) and scale=quick (commi
 49 and 80 photographs of 1,000 pixels and 160 of 160 (commit 0642912).
 """
 OPENED = 1e5
-"""What it takes to open a photograph, in pixels of one."""
+"""Opening a photograph takes as long as resampling this many of its pixels."""
 LAYERS = 0.1
 """CPU seconds of one thread for ``_layers``, on the same machine."""
 QUICK = ("sample", "viewer", "box")
