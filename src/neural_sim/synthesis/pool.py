@@ -33,21 +33,32 @@ class PooledSubject:
 
     Args:
         name: name of the object.
-        maps: premultiplied RGBA in 8 bits, ``per_cell`` of every combination of the factors' bins, one combination
-            after the other; the last factor's bins change fastest.
-        drawn: scene parameters of each map.
-        per_cell: number of maps of each combination.
+        maps: premultiplied RGBA in 8 bits, ``per_cell`` for each combination of the factors' bins (a cell); the last
+            factor's bins change fastest.
+        drawn: scene parameters of each map, cell by cell.
     """
 
     name: str
-    maps: UInt8[Tensor, "n height width 4"]
+    maps: UInt8[Tensor, "cells per_cell height width 4"]
     drawn: SceneDraw
-    per_cell: int
 
     @property
     def device(self) -> torch.device:
         """Device of the maps."""
         return self.maps.device
+
+    @property
+    def per_cell(self) -> int:
+        """Number of maps of each cell."""
+        return self.maps.shape[1]
+
+    def __len__(self) -> int:
+        return len(self.drawn)
+
+    def part(self, within: slice) -> PooledSubject:
+        """Return the maps ``within`` every cell, which share the memory of the whole."""
+        rows = torch.arange(len(self)).view(-1, self.per_cell)[:, within].flatten()
+        return PooledSubject(self.name, self.maps[:, within], self.drawn.select(rows))
 
     def draw(
         self,
@@ -90,9 +101,8 @@ class PooledSubject:
         cell = torch.zeros(len(bins), dtype=torch.long)
         for column, factor in zip(bins.unbind(1), distribution.binned, strict=True):
             cell = cell * factor.bins + column
-        index = cell * self.per_cell + within
-        maps = self.maps[index.to(self.device)].float() / 255
-        return RenderedObject(self.drawn.select(index), maps[..., :3], maps[..., 3])
+        maps = self.maps[cell.to(self.device), within.to(self.device)].float() / 255
+        return RenderedObject(self.drawn.select(cell * self.per_cell + within), maps[..., :3], maps[..., 3])
 
 
 def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: bool = False) -> Scene:
@@ -131,8 +141,8 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: b
             draw = replace(draw, weights=_mixed_lights(len(draw), distribution.lights, generator))
         part = scene.render(label, draw)
         maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
-        pooled = (maps * 255).round().to(torch.uint8)
-        subjects.append(PooledSubject(subject.name, pooled, part.draw, per_cell))
+        pooled = (maps * 255).round().to(torch.uint8).unflatten(0, (cells, per_cell))
+        subjects.append(PooledSubject(subject.name, pooled, part.draw))
     return replace(scene, subjects=tuple(subjects))
 
 

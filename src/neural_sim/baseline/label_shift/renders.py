@@ -14,6 +14,9 @@ from neural_sim.baseline.label_shift.network import Known
 from neural_sim.synthesis.pool import PooledSubject, pool_of
 from neural_sim.synthesis.scene import Scene
 
+PIXELS = 2**24
+"""Number of pixels of all renders in the images that are composed together. What a seed draws depends on it."""
+
 
 def pool_for(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
     """Return the scene itself if its renders are pooled, otherwise a pool of renders of all its bins and lights."""
@@ -32,13 +35,8 @@ def parted(pool: Scene, held_out: float) -> tuple[Scene, Scene]:
             raise ValueError(
                 f"label_shift: want at least two renders of every combination of bins, got {subject.per_cell}"
             )
-        within = torch.arange(len(subject.maps)) % subject.per_cell
-        for side, rows, each in zip(
-            sides, (within >= count, within < count), (subject.per_cell - count, count), strict=True
-        ):
-            index = rows.nonzero()[:, 0]
-            maps = subject.maps[index.to(subject.maps.device)]
-            side.append(PooledSubject(subject.name, maps, subject.drawn.select(index), each))
+        sides[0].append(subject.part(slice(count, None)))
+        sides[1].append(subject.part(slice(count)))
     return replace(pool, subjects=tuple(sides[0])), replace(pool, subjects=tuple(sides[1]))
 
 
@@ -71,13 +69,19 @@ def with_bank(scene: Scene, backgrounds: int, generator: torch.Generator) -> Sce
 
 
 def known_crops(part: Scene, compositions: int, generator: torch.Generator, whole: bool) -> Known:
-    """Compose images with all bins equally frequent, and cut out their boxes."""
+    """Compose images with all bins equally frequent, and cut out their boxes.
+
+    Images are composed in parts of ``PIXELS`` and thrown away once their boxes are cut out, which bounds the memory.
+    """
     distribution, subject = part.distribution, part.subjects[0]
     assert isinstance(subject, PooledSubject)
     psi = distribution.uniform_of([subject.name for subject in part.subjects])
+    renders = len(part.subjects) * part.synthesizer.count.mean * part.camera.width * part.camera.height
+    size = max(1, int(PIXELS / renders))
     parts: list[Known] = []
-    for _ in range(compositions):
-        drawn = part.training_set(psi, len(subject.maps), generator)
+    for start in [*range(0, len(subject), size)] * compositions:
+        count = min(size, len(subject) - start)
+        drawn = part.training_set(psi, count, generator)
         crops = crops_of(drawn.images.to("cpu"), whole)
         place = torch.full((len(part.subjects), len(drawn)), -1)
         for label, rows in enumerate(drawn.rows):
