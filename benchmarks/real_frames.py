@@ -83,14 +83,14 @@ def rolled(pool: Scene, generator: torch.Generator) -> Scene:
     subjects = []
     for subject in pool.subjects:
         assert isinstance(subject, PooledSubject)
-        maps = subject.maps.movedim(-1, 1).float()
+        maps = subject.maps.flatten(0, 1).movedim(-1, 1).float()
         height, width = maps.shape[-2:]
         angle = 2.0 * math.pi * torch.rand(len(maps), generator=generator)
         cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros(len(maps))
         matrix = torch.stack([cosine, -sine * height / width, zero, sine * width / height, cosine, zero], -1)
         grid = affine_grid(matrix.view(-1, 2, 3), list(maps.shape), align_corners=False)
         turned = grid_sample(maps, grid, align_corners=False).round().to(torch.uint8)
-        subjects.append(replace(subject, maps=turned.movedim(1, -1)))
+        subjects.append(replace(subject, maps=turned.movedim(1, -1).reshape(subject.maps.shape)))
     return replace(pool, subjects=tuple(subjects))
 
 
@@ -135,7 +135,8 @@ def read(
     reader: Reader, truth: Tensor, label: int, name: str, psi: Tensor, groups: Sequence[Sequence[int]]
 ) -> dict[str, Any]:
     """Return how well an object's boxes and held-out renders were read, and what was made of it."""
-    seen, held, cells = reader.posteriors(label, psi)
+    every_box = replace(reader, views=torch.arange(len(reader.target)))
+    seen, held, cells = every_box.posteriors(label, psi)
     (found,), _ = reader.read(label, name, psi, {"pose": groups})
     bins = seen.shape[1]
     own, start = truth[reader.target.labels == label], torch.tensor(found.start)

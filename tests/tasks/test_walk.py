@@ -22,6 +22,7 @@ from neural_sim.report.run_tracking import LiveRun
 from neural_sim.report.tracking import tracking_uri
 from neural_sim.stages.target_sets import TargetSets
 from neural_sim.synthesis.export.coco import write_coco
+from neural_sim.tasks.context import Task
 from neural_sim.tasks.walk import walk, warn_of_misreading
 
 SMALL = [
@@ -311,3 +312,16 @@ def test_an_estimate_from_photographs_comes_with_a_warning(tmp_path, caplog):
     assert [each for each, text in said.items() if text] == [("neural_sim", False), ("label_shift", False)]
     assert "a training judges the estimate" in said["neural_sim", False]
     assert "no training judges the estimate with baseline=label_shift" in said["label_shift", False]
+
+
+@pytest.mark.parametrize("task, warned", [("preflight", 1), ("psi", 1), ("views", 0), ("doctor", 0)])
+def test_every_task_that_shows_or_uses_the_estimate_warns(task, warned, tmp_path, monkeypatch):
+    class Nothing(Task):
+        def run(self, context):
+            pass
+
+    graphs = []
+    monkeypatch.setattr("neural_sim.tasks.walk.warn_of_misreading", graphs.append)
+    context, _ = _context(tmp_path, "stages=[views]")
+    walk(context, {task: Nothing()})
+    assert len(graphs) == warned

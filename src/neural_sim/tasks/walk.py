@@ -134,7 +134,7 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
     phases = PHASES.keys() & tasks.keys()
     if phases:
         warn_of_uncovered(context.graph)
-    if {"psi", "evaluate", "report"} & phases:
+    if {"psi", "evaluate", "report"} & phases or "preflight" in tasks:
         warn_of_misreading(context.graph)
     wanted = [stage for task in tasks.values() for stage in task.reads(context)]
     if wanted:

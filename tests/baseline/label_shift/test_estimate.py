@@ -8,21 +8,21 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from neural_sim.baseline.label_shift import reading
-from neural_sim.baseline.label_shift.crops import Augmentation
+from neural_sim.baseline.label_shift import reading, renders
+from neural_sim.baseline.label_shift.crops import Augmentation, views_of
 from neural_sim.baseline.label_shift.estimate import LabelShift, estimate, trained_reader
 from neural_sim.baseline.label_shift.mixture import Status
 from neural_sim.baseline.label_shift.network import Fitting
 from neural_sim.parameter.distributions import total_variation
 from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, SceneDistribution
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.pool import PooledSubject
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.synthesizer import Synthesizer
-from neural_sim.types import PinholeCamera
+from neural_sim.types import LabelledImages, PinholeCamera
 
 SIDE, EACH = 48, 24
 COLOURS = {"lamp": (0.9, 0.8, 0.2), "cup": (0.2, 0.8, 0.9)}
@@ -45,7 +45,7 @@ def painted(name, distribution):
         patch = torch.tensor([int(255 * c) for c in COLOURS[name]] + [255], dtype=torch.uint8)
         top, left = low + down * half, low + across * half
         maps[row, top + 2 : top + half - 2, left + 2 : left + half - 2] = patch
-    return PooledSubject(name, maps, draw, EACH)
+    return PooledSubject(name, maps.unflatten(0, (-1, EACH)), draw)
 
 
 def scene_of(*parameters, **synthesis):
@@ -126,6 +126,61 @@ def test_the_same_seed_gives_the_same_estimate(posed, found, monkeypatch):
     assert read(*posed).factors == found.factors
 
 
+def test_images_composed_in_parts_are_read_as_well_and_take_less_memory(posed, monkeypatch):
+    scene, target, psi = posed
+    sizes, compose = [], Scene.training_set
+
+    def counted(self, psi, count, generator, how=HARD):
+        sizes.append(count)
+        return compose(self, psi, count, generator, how)
+
+    monkeypatch.setattr(Scene, "training_set", counted)
+    monkeypatch.setattr(renders, "PIXELS", 2 * 10 * SIDE**2)
+    found = read(scene, target, psi)
+    assert max(sizes) == 10 and sum(sizes) == len(scene.subjects[0]) and found.images == 2 * sum(sizes)
+    assert min(one.accuracy for one in found.factors) > 0.8
+    assert [one.finding for one in found.factors] == ["moves", "stays"]
+    several = replace(scene, synthesizer=replace(scene.synthesizer, objects_per_image=(2, 2)))
+    sizes.clear()
+    read(several, target, psi)
+    assert max(sizes) == 5
+
+
+def test_frames_of_a_video_are_no_more_evidence_than_one_of_them(posed, found):
+    """Every image five times, moved by a pixel or two: the estimate of the images alone."""
+    scene, target, psi = posed
+    assert [one.repeated for one in found.factors] == [0, 0]
+    again = LabelledImages.concatenate([target] + [_moved(target, step) for step in (-1, 1, -2, 2)])
+    video = read(scene, again, psi)
+    assert [(one.boxes, one.repeated) for one in video.factors] == [(40, 160), (40, 160)]
+    for one, same in zip(video.factors, found.factors, strict=True):
+        assert one.finding == same.finding
+        assert float(total_variation(torch.tensor(one.p), torch.tensor(same.p))) < 0.1
+
+
+def _moved(images, step):
+    boxes = images.boxes.clone()
+    boxes[..., [0, 2]] = (boxes[..., [0, 2]] + step).clamp(0, SIDE)
+    return replace(images, images=images.images.roll(step, 3), boxes=boxes)
+
+
+def test_views_are_of_one_object_at_one_place_in_images_that_look_alike(posed):
+    target = posed[1].select(torch.arange(3))
+    twice = LabelledImages.concatenate([target, target])
+    assert views_of(twice, False).tolist() == [0, 1, 2, 0, 1, 2]
+    elsewhere = replace(twice, boxes=twice.boxes.clone())
+    elsewhere.boxes[3] += SIDE / 2
+    assert views_of(elsewhere, False).tolist() == [0, 1, 2, 3, 1, 2]
+    assert views_of(elsewhere, True).tolist() == [0, 1, 2, 0, 1, 2]
+    other = replace(twice, labels=twice.labels.clone())
+    other.labels[4] = 1 - other.labels[4]
+    assert views_of(other, False).tolist() == [0, 1, 2, 0, 4, 2]
+    barred = replace(target, images=target.images.clone())
+    barred.images[:, :, :14] = 0.5
+    barred.images[:, :, -14:] = 0.5
+    assert views_of(barred, True).tolist() == [0, 1, 2]
+
+
 def test_boxes_that_look_like_no_render_move_nothing(posed):
     scene, target, psi = posed
     noise = torch.rand(target.images.shape, generator=torch.Generator().manual_seed(1))
@@ -166,8 +221,9 @@ def test_an_object_whose_field_is_bad_moves_nothing_and_the_other_is_read(posed)
     """A field of wrong poses: its patch is on the other side, in fog. It says with certainty what is wrong."""
     scene, target, psi = posed
     lamp, cup = scene.subjects
-    fog = avg_pool2d(lamp.maps.flip(2).movedim(-1, 1).float(), 7, 1, 3).movedim(1, -1)
-    bad = replace(scene, subjects=(replace(lamp, maps=fog.round().to(torch.uint8)), cup))
+    fog = avg_pool2d(lamp.maps.flatten(0, 1).flip(2).movedim(-1, 1).float(), 7, 1, 3).movedim(1, -1)
+    fog = fog.round().to(torch.uint8).unflatten(0, (-1, EACH))
+    bad = replace(scene, subjects=(replace(lamp, maps=fog), cup))
     result = read(bad, target, psi)
     lamp, cup = result.factors
     assert lamp.accuracy > 0.8 and float(total_variation(torch.tensor(lamp.p), torch.tensor(P))) > 0.5
@@ -178,7 +234,7 @@ def test_an_object_whose_field_is_bad_moves_nothing_and_the_other_is_read(posed)
 def test_renders_that_are_not_told_apart_move_nothing(posed):
     """An object that looks the same from everywhere: its classifier is at chance, and says so."""
     scene, target, psi = posed
-    alike = tuple(replace(each, maps=each.maps[:1].expand_as(each.maps)) for each in scene.subjects)
+    alike = tuple(replace(each, maps=each.maps[:1, :1].expand_as(each.maps)) for each in scene.subjects)
     result = read(replace(scene, subjects=alike), target, psi)
     lamp = result.factors[0]
     assert (
@@ -282,7 +338,7 @@ def test_distances_are_read_off_the_size_of_boxes_where_few_renders_say_little_e
         )
     noise = distribution.draw_noise(len(maps), generator)
     draw = distribution.at_bins({"zoom": torch.arange(4).repeat_interleave(EACH)}, noise)
-    subjects = tuple(PooledSubject(name, maps, draw, EACH) for name in COLOURS)
+    subjects = tuple(PooledSubject(name, maps.unflatten(0, (-1, EACH)), draw) for name in COLOURS)
     scene = Scene(subjects, PinholeCamera(SIDE, SIDE, 0.7), Synthesizer(ProceduralClutter()), distribution)
     lamp, cup = read(scene, target_of(scene, P), distribution.uniform.expand(2, -1)).factors
     assert min(lamp.accuracy, cup.accuracy) > 0.9
@@ -320,7 +376,7 @@ def lit(name, distribution, weights):
     maps = torch.zeros(len(weights), SIDE, SIDE, 4, dtype=torch.uint8)
     maps[:, 12:36, 12:36, :3] = (weights @ HUES).round().to(torch.uint8)[:, None, None]
     maps[:, 12:36, 12:36, 3] = 255
-    return PooledSubject(name, maps, draw, len(weights))
+    return PooledSubject(name, maps[None], draw)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])

@@ -52,6 +52,13 @@ def test_a_sentence_says_why_psi_does_not_move(finding, said):
     assert said in dataclasses.replace(MOVES, finding=finding, doubt=0.4).sentence
 
 
+def test_boxes_of_near_duplicates_are_named_where_there_are_too_few_others():
+    few = dataclasses.replace(MOVES, finding="too few boxes", boxes=3, repeated=12)
+    assert (
+        few.sentence == "mug: too few boxes (3, and 12 in images that look like theirs) to estimate its pose"
+    )
+
+
 def test_an_estimate_that_is_only_nearer_says_how_far_off_both_may_be():
     nearer = dataclasses.replace(MOVES, finding="nearer", doubt=0.4, apart=0.86)
     assert nearer.sentence == (

@@ -7,14 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated
 
+import numpy as np
 import torch
 from annotated_types import Ge, Le
 from jaxtyping import Float, Int
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, affine_grid, grid_sample
-from torchvision.ops import roi_align
+from torchvision.ops import box_iou, roi_align
 
 from neural_sim.ranges import Fraction, NonNegative, validated
+from neural_sim.target.split import ALIKE, CELLS, correlation, thumbnail
 from neural_sim.types import LabelledImages
 
 SIDE = 32
@@ -23,6 +26,7 @@ MARGIN = 1.5
 """Side of a stored crop, in multiples of the box's longer side: it contains nearly all of a rotated and shifted view,
 the rest of which repeats the crop's border."""
 _STORED = 44
+_COVERED = 0.75  # fraction of an image in boxes above which too little is left around them to compare
 _SHOWN = 1.1  # side of the network's view, in multiples of the box's longer side
 BOX_NUMBERS = 5
 """How many numbers describe a box."""
@@ -83,6 +87,53 @@ def crops_of(images: LabelledImages, whole: bool) -> Crops:
         [(size / edges[2:]).log(), 2.0 * centre / edges[2:] - 1.0, touches[:, None].to(boxes)], 1
     )
     return Crops(pixels, numbers, images.labels[rows, columns], rows)
+
+
+def views_of(images: LabelledImages, whole: bool) -> Int[Tensor, "boxes"]:
+    """Return the numbers of the views that boxes show; near-duplicates, such as frames of one video, share a view.
+
+    Two boxes show one view if they have the same label, overlap by half, and their images look alike
+    (``target.split``), also outside all boxes, because independent photographs may show an object in the same pose.
+    With ``whole``, only the label and the image count. Boxes of a chain of such pairs show one view. The order is that
+    of ``crops_of``.
+    """
+    alike = torch.ones(len(images), len(images), dtype=torch.bool)
+    for outside in (False,) if whole else (False, True):
+        thumbnails = torch.stack([_thumbnail(images, row, outside) for row in range(len(images))])
+        alike &= correlation(thumbnails, thumbnails) >= ALIKE
+    rows, columns = images.present.nonzero().unbind(1)
+    labels, boxes = images.labels[rows, columns], images.boxes[rows, columns]
+    views = torch.arange(len(rows))
+    for label in labels.unique():
+        mine = (labels == label).nonzero()[:, 0]
+        same = alike[rows[mine]][:, rows[mine]]
+        if not whole:
+            same = same & (box_iou(boxes[mine], boxes[mine]) >= 0.5)
+        _, part = connected_components(same.numpy(), directed=False)
+        _, first, inverse = np.unique(part, return_index=True, return_inverse=True)
+        views[mine] = mine[torch.from_numpy(first[inverse])]
+    return views
+
+
+def _thumbnail(images: LabelledImages, row: int, outside: bool) -> Float[Tensor, "24 24"]:
+    """Return the thumbnail of an image, ``outside`` its boxes unless they cover most of it.
+
+    Plain borders are cut off first, because their edges would make all letterboxed photographs look alike.
+    """
+    image, inside = images.images[row], torch.zeros_like(images.images[row, :1])
+    for box in images.boxes[row, images.present[row]] if outside else ():
+        low, high = box[:2].floor().long().clamp_min(0), box[2:].ceil().long()
+        inside[:, low[1] : high[1], low[0] : high[0]] = 1.0
+    for axis in (1, 2):
+        varied = (image.amax(axis) - image.amin(axis)).amax(0) > 1e-3
+        kept = varied.nonzero()[:, 0]
+        if len(kept):
+            start, length = int(kept[0]), int(kept[-1] - kept[0]) + 1
+            image, inside = (each.narrow(3 - axis, start, length) for each in (image, inside))
+    covered = adaptive_avg_pool2d(inside, CELLS)[0] > 0.0
+    if covered.float().mean() > _COVERED:
+        covered = torch.zeros_like(covered)
+    return thumbnail(image).masked_fill(covered, 0.0)
 
 
 @validated

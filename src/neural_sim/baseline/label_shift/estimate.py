@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.baseline.label_shift.crops import crops_of
+from neural_sim.baseline.label_shift.crops import crops_of, views_of
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.baseline.label_shift.mixture import Cells
 from neural_sim.baseline.label_shift.network import BinNetwork
@@ -125,5 +125,6 @@ def trained_reader(
         augmentation = replace(augmentation, exposure=0.0)
     settings.fitting(training, network, augmentation, generator)
     clock("network")
-    target = crops_of(validation.to("cpu"), whole)
-    return Reader(settings, distribution, network, training, held, target, generator)
+    images = validation.to("cpu")
+    target, views = crops_of(images, whole), views_of(images, whole)
+    return Reader(settings, distribution, network, training, held, target, views, generator)

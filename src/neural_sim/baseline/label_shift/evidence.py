@@ -59,7 +59,7 @@ class FactorEstimate:
     Attributes:
         name: the object.
         factor: the factor of psi.
-        boxes: number of boxes that were read.
+        boxes: number of boxes that were read; those of one view count as one (``views_of``).
         start: probabilities of the bins, or weights of the lights, at the present psi.
         p: estimated probabilities of the bins, or weights of the lights.
         low: lower ends of their intervals.
@@ -79,6 +79,7 @@ class FactorEstimate:
         apart: the same between the present psi and the target's distribution.
         converged: whether the search for the mixture converged, which it does not if the likelihood is flat.
         lights: whether ``p`` are weights of lights instead of probabilities of bins.
+        repeated: number of further boxes, in near-duplicates of the images that count.
     """
 
     name: str
@@ -98,12 +99,14 @@ class FactorEstimate:
     apart: float = 0.0
     converged: bool = True
     lights: bool = False
+    repeated: int = 0
 
     @property
     def sentence(self) -> str:
         """Return the finding as a sentence for the console and the pages."""
         if self.finding == "too few boxes":
-            return f"{self.name}: too few boxes ({self.boxes}) to estimate its {self.factor}"
+            repeated = f", and {self.repeated} in images that look like theirs" if self.repeated else ""
+            return f"{self.name}: too few boxes ({self.boxes}{repeated}) to estimate its {self.factor}"
         if self.finding == "fits no render":
             return (
                 f"{self.name}: its boxes do not look like its renders (a box is stranger than a held-out render in "

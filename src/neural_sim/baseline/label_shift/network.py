@@ -160,6 +160,14 @@ class Outputs:
     def __len__(self) -> int:
         return len(self.features)
 
+    def averaged(self, views: Int[Tensor, "n"]) -> Outputs:
+        """Average the outputs of each view: equal ``views`` are one observation, made more than once."""
+        found, index, counts = views.unique(return_inverse=True, return_counts=True)
+        if len(found) == len(views):
+            return self
+        mean = (index == torch.arange(len(found))[:, None]).double() / counts[:, None]
+        return Outputs(mean @ self.logits, mean @ self.weights, mean @ self.features)
+
 
 @torch.no_grad()
 def outputs_of(network: BinNetwork, crops: Crops) -> Outputs:

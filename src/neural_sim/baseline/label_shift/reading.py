@@ -48,6 +48,7 @@ class Reader:
         training: crops on which it was trained.
         held: crops of held-out renders.
         target: crops of the target.
+        views: which view each of them shows; see ``views_of``.
         generator: the source of all random numbers.
     """
 
@@ -57,6 +58,7 @@ class Reader:
     training: Known
     held: Known
     target: Crops
+    views: Int[Tensor, "boxes"]
     generator: torch.Generator
 
     def read(
@@ -75,8 +77,8 @@ class Reader:
 
     def posteriors(
         self, label: int, psi: Float[Tensor, "K"]
-    ) -> tuple[Float[Tensor, "boxes cells"], Float[Tensor, "held cells"], Int[Tensor, "held"]]:
-        """Return calibrated posteriors of an object's boxes and held-out renders, and the true cells of the latter."""
+    ) -> tuple[Float[Tensor, "views cells"], Float[Tensor, "held cells"], Int[Tensor, "held"]]:
+        """Return calibrated posteriors of an object's views and held-out renders, and the true cells of the latter."""
         object_ = self._object(label, "", psi, {})
         return *object_.posteriors, object_.held.cells
 
@@ -87,13 +89,16 @@ class Reader:
             known.select((known.crops.labels == label) & drawn[known.cells])
             for known in (self.training, self.held)
         )
-        target = self.target.select(self.target.labels == label)
-        seen, known = (self._guessed(training, crops, drawn) for crops in (target, held.crops))
+        mine = self.target.labels == label
+        seen, known = (
+            self._guessed(training, crops, drawn) for crops in (self.target.select(mine), held.crops)
+        )
         limits = None  # stays None if no render shows the object
         if len(training.crops) and len(held.crops):
             features = outputs_of(self.network, training.crops).features
             limits = Strangeness.of(features, training.cells, training.weights.double())
-        return _Object(self, name, now, groups, held, known, seen, limits)
+        boxes, seen = len(seen), seen.averaged(self.views[mine])
+        return _Object(self, name, now, groups, held, known, seen, boxes, limits)
 
     def _guessed(self, training: Known, crops: Crops, drawn: Bool[Tensor, "cells"]) -> Outputs:
         """Return the network's outputs, with logits from boxes alone and weights of lights from colours alone added."""
@@ -126,7 +131,8 @@ class _Read:
 class _Object:
     """One object, with its ``psi`` by factor.
 
-    ``known`` are the outputs for its held-out renders (``held``), ``seen`` those for the target's boxes.
+    ``known`` are the outputs for its held-out renders (``held``), ``seen`` those for the views that the target's
+    ``boxes`` show.
     """
 
     reader: Reader
@@ -136,6 +142,7 @@ class _Object:
     held: Known
     known: Outputs
     seen: Outputs
+    boxes: int
     limits: Strangeness | None
 
     @property
@@ -191,6 +198,7 @@ class _Object:
         return FactorEstimate(
             self.name, factor.name, boxes, start, span.p, span.low, span.high, own, read.p_value, strange,
             read.accuracy, finding, read.chance, span.doubt, span.apart, read.converged, factor.lights > 0,
+            self.boxes - boxes,
         )  # fmt: skip
 
     def _binned(self) -> tuple[dict[str, _Read], Float[Tensor, "held"]]:
