@@ -19,7 +19,7 @@ GRID = functools.partial(
     GridFitting, resolution=64, refine_steps=(13,), prune_steps=(27,), prune_rays=500, batch_rays=200
 )
 RECIPES = {
-    "grid": FieldRecipe(lambda: GridField(features=4, head_width=4), GRID, STEPS, score_every=5),
+    "grid": FieldRecipe(lambda: GridField(features=4, head_width=4), GRID, STEPS),
     "appearance": FieldRecipe(
         lambda: AppearanceField(head_width=8, code_size=4),
         lambda field: AppearanceFitting(field, GRID, shared_lights=False, anchors=3, transients=True),
@@ -55,7 +55,7 @@ def _fit(recipe, views, checkpoint=None, killed_at=None):
         made.loss = counted
         return made
 
-    counting = FieldRecipe(recipe.field, fitting, recipe.steps, score_every=recipe.score_every)
+    counting = FieldRecipe(recipe.field, fitting, recipe.steps)
     field, history = counting.fit(views, 2, torch.device("cpu"), checkpoint)
     scores = [{key: value for key, value in row.items() if key != "seconds"} for row in history]
     return {name: tensor.tolist() for name, tensor in field.state_dict().items()}, scores, taken

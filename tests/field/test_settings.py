@@ -35,7 +35,6 @@ CASES = [
     ),
     (RECIPE, {"steps": 0}, "FieldRecipe.steps: want at least 1"),
     (RECIPE, {"final_rate": 0.0}, "FieldRecipe.final_rate: want more than 0 and at most 1"),
-    (RECIPE, {"score_every": -1}, "FieldRecipe.score_every: want at least 0"),
     (SceneMasks, {"resolution": 98}, "SceneMasks.resolution: want at least 16 and a multiple of 4, got 98"),
     (SceneMasks, {"batch_rays": 0}, "SceneMasks.batch_rays: want at least 1"),
     (SceneMasks, {"seed": -1}, "SceneMasks.seed: want at least 0"),

@@ -45,7 +45,6 @@ class FieldRecipe:
         fitting: makes the fitting of a field.
         steps: budget of optimiser steps.
         final_rate: final learning rates as a fraction of the initial ones; they fall exponentially.
-        score_every: number of steps between scores on the held-out views; 0: only at the end.
         seed: seed of the order of rays and of new weights, except those of ``MLPField``, which has a seed of its own;
             separate from the run's seed, so that runs share fields.
     """
@@ -54,7 +53,6 @@ class FieldRecipe:
     fitting: Callable[[RadianceField], Fitting]
     steps: PositiveInt = 1000
     final_rate: PositiveFraction = 0.1
-    score_every: NonNegativeInt = 0
     seed: NonNegativeInt = 0
 
     @property
@@ -77,9 +75,8 @@ class FieldRecipe:
         fitting.checkpoint = checkpoint
         generator = torch.Generator().manual_seed(self.seed)
         return fit_field(
-            placed, fitting, generator, steps=self.steps, held_out=held_out,
-            final_rate=self.final_rate, score_every=self.score_every,
-        )  # fmt: skip
+            placed, fitting, generator, steps=self.steps, held_out=held_out, final_rate=self.final_rate
+        )
 
 
 def fit_field(
@@ -90,7 +87,6 @@ def fit_field(
     steps: int,
     held_out: int = 0,
     final_rate: float = 0.1,
-    score_every: int = 0,
 ) -> tuple[RadianceField, list[dict[str, float]]]:
     """Fit ``fitting.field`` to all but the last ``held_out`` views, on which it is scored (``RadianceFieldModule``).
 
@@ -112,7 +108,6 @@ def fit_field(
         generator,
         steps,
         final_rate,
-        score_every,
     )
     trainer_on(views.images.device).fit(module)
     return module.field.eval().requires_grad_(False), module.history
@@ -149,9 +144,9 @@ class RadianceFieldModule(lightning.LightningModule):
     """Fits a field to ``views`` with Adam and scores it on ``held_out``.
 
     One step is one batch of rays; the learning rate falls exponentially to ``final_rate`` of its start over ``steps``.
-    The held-out views are rendered every ``score_every`` steps (0: only at the end); each score is a row of
-    ``history`` {seconds, step, psnr, psnr_foreground, ssim} and is logged as ``field/...``. Seconds count the
-    fitting from the start of preparation, without the scoring itself.
+    The held-out views are rendered after the last step; their score is the row of ``history`` {seconds, step, psnr,
+    psnr_foreground, ssim} and is logged as ``field/...``. Seconds count the fitting from the start of preparation,
+    without the scoring itself.
     """
 
     def __init__(
@@ -162,17 +157,15 @@ class RadianceFieldModule(lightning.LightningModule):
         generator: torch.Generator,
         steps: PositiveInt,
         final_rate: PositiveFraction = 0.1,
-        score_every: NonNegativeInt = 0,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.fitting, self.field = fitting, fitting.field
         self.views, self.held_out, self.generator = views, held_out, generator
-        self.steps, self.final_rate, self.score_every = steps, final_rate, score_every
+        self.steps, self.final_rate = steps, final_rate
         self.history: list[dict[str, float]] = []
         self._steps_done = 0
         self._begun = time.perf_counter()
-        self._paused = 0.0
         self._optimised: dict[str, Any] | None = None
 
     @override
@@ -186,7 +179,7 @@ class RadianceFieldModule(lightning.LightningModule):
     def _restore(self, state: Mapping[str, Any]) -> None:
         self.fitting.restore(state["fitting"])
         self.generator.set_state(state["generator"])
-        self.history, self._steps_done, self._optimised = state["history"], state["step"], state["optimiser"]
+        self._steps_done, self._optimised = state["step"], state["optimiser"]
         self._begun = time.perf_counter() - state["seconds"]
         _log.info("field: resumes after step %d/%d of an interrupted run", self._steps_done, self.steps)
 
@@ -198,9 +191,8 @@ class RadianceFieldModule(lightning.LightningModule):
             "fitting": _on_cpu(fitting),
             "optimiser": _on_cpu(optimiser.state_dict()),
             "generator": self.generator.get_state(),
-            "history": self.history,
             "step": self._steps_done,
-            "seconds": time.perf_counter() - self._begun - self._paused,
+            "seconds": time.perf_counter() - self._begun,
         }
 
     def train_dataloader(self) -> DataLoader[int]:
@@ -237,21 +229,18 @@ class RadianceFieldModule(lightning.LightningModule):
                 f"field: the loss is {float(loss.detach())} after {self.steps} steps: want smaller learning rates "
                 "under field.fitting"
             )
-        if last or (self.score_every and self._steps_done % self.score_every == 0):
+        if last:
             self._score()
-        if self.fitting.checkpoint is not None and not last:
+        elif self.fitting.checkpoint is not None:
             self.fitting.checkpoint.offer(self._state)
 
     def _score(self) -> None:
         if self.held_out is None:
             return
         synchronise(self.held_out.images.device)
-        now = time.perf_counter()
+        seconds = time.perf_counter() - self._begun
         self.field.eval()
         scores = self.fitting.score(self.held_out, TERMINATION, RAYS_PER_CHUNK)
-        self.field.train()
-        seconds = now - self._begun - self._paused
-        self._paused += time.perf_counter() - now
         self.history.append({"seconds": seconds, "step": float(self._steps_done), **scores})
         self.log_dict({f"field/{name}": value for name, value in scores.items()} | {"field/seconds": seconds})
 

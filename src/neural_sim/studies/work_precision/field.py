@@ -24,7 +24,7 @@ def scaled(recipe: FieldRecipe, part: float) -> FieldRecipe:
             if key in fitting.keywords
         }
         fitting = functools.partial(fitting.func, *fitting.args, **{**fitting.keywords, **moved})
-    return replace(recipe, steps=max(1, round(part * recipe.steps)), fitting=fitting, score_every=0)
+    return replace(recipe, steps=max(1, round(part * recipe.steps)), fitting=fitting)
 
 
 @validated
