@@ -127,7 +127,6 @@ class ReversedStep:
     """One reversed step.
 
     Attributes:
-        step: its number.
         params: theta before the step.
         along: a_t.
         rows: the rows of its batch.
@@ -135,7 +134,6 @@ class ReversedStep:
         inputs: derivative of the mean score by the inputs of these rows; empty unless wanted.
     """
 
-    step: int
     params: Params
     along: Params
     rows: Int[Tensor, "batch"]
@@ -203,12 +201,7 @@ def reversed_steps(
                 curvature = curved(examples, state[0], like, rows, along, wanted == "inputs")
             cotangents[0] = cotangents[0] + curvature.product + examples.proximal * along
             yield ReversedStep(
-                step,
-                unflatten(state[0], like),
-                unflatten(along, like),
-                rows,
-                curvature.scores,
-                curvature.inputs,
+                unflatten(state[0], like), unflatten(along, like), rows, curvature.scores, curvature.inputs
             )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
@@ -35,7 +34,6 @@ class Adjoint:
     damping: Damped
     damping_raises: int
     doubled: Float[Tensor, "n"] | None
-    seconds: float
 
     @property
     def vector(self) -> Float[Tensor, "n"]:
@@ -76,7 +74,6 @@ class AdjointSolver:
         generator: torch.Generator,
     ) -> Adjoint:
         """Solve for the right-hand side ``b``, warm-started from ``x0``; ``generator`` draws a Lanczos start."""
-        began = time.perf_counter()
         operator = self.operator(terms, params)
         damped = self.damping.choose(operator, b, generator)
         solution = self._solve(operator, damped, b, x0)
@@ -92,7 +89,7 @@ class AdjointSolver:
         if self.sensitivity:
             twice = self._solve(operator, damped, b, solution.value, 2.0)
             doubled, solution = twice.value, _after(twice, solution)
-        return Adjoint(solution, damped, damping_raises, doubled, time.perf_counter() - began)
+        return Adjoint(solution, damped, damping_raises, doubled)
 
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0

@@ -52,11 +52,6 @@ class Estimate:
     seconds: float = 0.0
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def sentences(self) -> list[str]:
-        """One sentence for each object and factor, for the console and the pages."""
-        return [one.sentence for one in self.factors]
-
 
 @dataclass
 class Clock:

@@ -40,13 +40,11 @@ class Mixed:
         p: probabilities of every factor's bins.
         log_likelihood: log-likelihood of the boxes, up to a constant.
         status: how the search ended.
-        steps: number of steps taken.
     """
 
     p: Probabilities
     log_likelihood: Float[Tensor, "*batch"]
     status: Status
-    steps: int
 
 
 @dataclass(frozen=True)
@@ -132,8 +130,8 @@ def maximise(
         fixed[i].double().expand(*batch, size) if i in fixed else like.new_full((*batch, size), 1.0 / size)
         for i, size in enumerate(cells.sizes)
     )
-    status, taken = Status.MAX_STEPS, steps
-    for step in range(1, steps + 1):
+    status = Status.MAX_STEPS
+    for _ in range(steps):
         counts = _expected(like, cells.joint(p))
         new = tuple(
             old if i in fixed else _normalised(own + prior)
@@ -142,9 +140,9 @@ def maximise(
         change = max(float((a - b).abs().max()) for a, b in zip(new, p, strict=True))
         p = new
         if change <= tolerance:
-            status, taken = Status.CONVERGED, step
+            status = Status.CONVERGED
             break
-    return Mixed(p, log_likelihood(like, cells.joint(p)), status, taken)
+    return Mixed(p, log_likelihood(like, cells.joint(p)), status)
 
 
 def log_likelihood(
