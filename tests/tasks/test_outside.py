@@ -1,4 +1,4 @@
-"""A task from outside the package: one class, one configuration node."""
+"""Tasks beyond those of the package: an unknown one is refused, and a failure of one is the command's."""
 
 import os
 import subprocess
@@ -9,29 +9,16 @@ import pytest
 from composing import composed
 
 from neural_sim.main import UserError, context_of
-from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[2]
-PLUGIN = '''
-from dataclasses import dataclass
-
+PLUGIN = """
 from neural_sim.tasks.context import Task, TaskFailure
-
-
-@dataclass(frozen=True)
-class Count(Task):
-    """Counts the objects and writes the number."""
-
-    times: int = 1
-
-    def run(self, context):
-        (context.folder / "count.txt").write_text(str(self.times * len(context.graph.names)))
 
 
 class Fail(Task):
     def run(self, context):
         raise TaskFailure("two checks failed")
-'''
+"""
 
 
 @pytest.fixture
@@ -42,27 +29,11 @@ def plugin(tmp_path, monkeypatch):
     sys.modules.pop("my_task", None)
 
 
-def context(folder, *overrides):
-    config = composed("+experiment=pose_gap", "scale=smoke", *overrides)
-    return context_of(config, folder)
-
-
-def test_a_task_from_outside_is_one_class_and_one_node(tmp_path, plugin):
-    overrides = ["+count={_target_: my_task.Count, times: 2}", "stages=[count]"]
-    assert walk(*context(tmp_path, *overrides)) is None
-    assert (tmp_path / "count.txt").read_text() == "12"
-
-
-def test_its_settings_are_checked_like_all_others(tmp_path, plugin):
-    with pytest.raises(UserError, match=r"count.times: want a whole number, got 'two'"):
-        context(tmp_path, "+count={_target_: my_task.Count, times: two}", "stages=[count]")
-
-
 def test_an_unknown_stage_is_one_line_with_those_that_there_are(tmp_path, plugin):
     with pytest.raises(UserError) as caught:
-        context(tmp_path, "+count={_target_: my_task.Count}", "stages=[views,fields]")
+        context_of(composed("+fail={_target_: my_task.Fail}", "stages=[views,fields]"), tmp_path)
     known = "views, field, target_sets, warm_start, psi, evaluate, report"
-    more = "preflight, repeat, predict, export, box, viewer, doctor, count"
+    more = "preflight, repeat, predict, export, box, viewer, doctor, fail"
     assert str(caught.value) == f"stages: unknown stage 'fields', want some of {known}, {more}"
 
 
