@@ -96,7 +96,7 @@ GONE: dict[str, str] = {
     "baseline=bayes_opt": "want baseline=lts, which learns from the same rewards",
     "gradient.theta_mode=reverse": "it gained nothing; want forward or central_difference, with gradient=stratified",
     "outer.certify": "the reference is always the response of training; want outer.certify_every alone",
-    "outer.certify_per_bin": "it belonged to outer.certify=retrained, which only the tests use now; leave it out",
+    "outer.certify_per_bin": "it belonged to outer.certify=retrained; leave it out",
     "baseline.max_step": "baseline=lts draws psi now; want baseline.deviation or baseline.learning_rate",
     "synthesis.label_gradient": "derivatives of boxes gained nothing (docs/paper.md); boxes are fixed labels",
 }
