@@ -21,7 +21,6 @@ MISTAKES = [  # what is typed, where {here} is a folder with an empty one, and w
     ("stages=[train]", "no stage train; want some of views, field, target_sets, warm_start, psi, evaluate, report, "),
     ("stages=[fields,psi]", "no stage fields; did you mean field?"),
     ("stages=[export", "check its brackets and quotes"),
-    ("baseline=random_search", "is gone: want baseline=lts"),
     ("objects=photos objects.root={here}/mugs", "mugs does not exist; want a folder that holds a folder for"),
     ("objects.root={here}", "want objects=bop or objects=co3d or objects=folder or objects=photos or objects=ycb"),
     ("target=coco target.annotations={here}/val.json", "val.json does not exist; want a COCO file of labelled"),

@@ -37,7 +37,6 @@ from neural_sim.configuration import (
     named,
     own_folder,
     replaced,
-    updated,
     view_size,
 )
 from neural_sim.declared import check_early
@@ -380,9 +379,7 @@ def main() -> None:
             print(said)
             return
         try:
-            sys.argv[1:], notes = updated(spoken(sys.argv[1:]))
-            for note in notes:
-                print(f"neural-sim: {note}", file=sys.stderr)
+            sys.argv[1:] = spoken(sys.argv[1:])
             if layout is not None:
                 checked(sys.argv[1:], layout, VERBS)
                 present(sys.argv[1:])

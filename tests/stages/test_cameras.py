@@ -10,7 +10,6 @@ import pytest
 from captures import capture
 from composing import composed
 
-from neural_sim.configuration import updated
 from neural_sim.main import context_of
 from neural_sim.objects.capture import Capture
 from neural_sim.objects.found import FoundCapture
@@ -92,9 +91,7 @@ def test_cameras_depend_on_photographs_and_finder_alone(alone, tmp_path):
 
 
 def test_the_command_line_asks_for_them(alone, tmp_path, monkeypatch):
-    words, notes = updated(["objects.poses=colmap", "objects.poses.rounds=3", "objects.poses.features=900"])
-    assert words == ["objects/poses=colmap", "objects.refinement.rounds=3", "objects.poses.features=900"]
-    assert len(notes) == 2
+    words = ["objects/poses=colmap", "objects.refinement.rounds=3", "objects.poses.features=900"]
     where = [f"objects.root={alone}", f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db"]
     config = composed("objects=photos", "scale=smoke", "stages=[views]", *words, *where)
     monkeypatch.setattr(Colmap, "find", lambda self, *more: Known().find(*more))
