@@ -97,6 +97,14 @@ def test_a_point_finds_the_smallest_box_in_its_range_about_whose_centre_it_is():
     assert targets.deltas[0, row].tolist() == pytest.approx([0.75] * 4)
 
 
+def test_a_distance_at_the_end_of_a_range_belongs_to_the_finer_level():
+    """The farthest sides of boxes of whole pixels are often at such a distance; torchvision gives it to no level."""
+    detector = make_fcos(size=96, points=Points(limits=(28,)))
+    targets = detector.assign(torch.tensor([[[4.0, 20, 60, 28]]]), torch.tensor([[0]]))
+    fine, coarse = ((part >= 0).sum() for part in targets.labels.split(detector.anchors_per_level, 1))
+    assert (int(fine), int(coarse)) == (1, 0)
+
+
 def test_generalised_iou_about_a_point_is_torchvisions():
     generator = torch.Generator().manual_seed(0)
     ours, theirs = (torch.rand(50, 4, generator=generator, dtype=torch.float64) + 0.01 for _ in range(2))

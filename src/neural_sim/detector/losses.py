@@ -88,10 +88,12 @@ def assign_points(
     labels: Int[Tensor, "images boxes"],
     radius: float,
 ) -> Targets:
-    """Match points to boxes like torchvision's FCOS.
+    """Match points to boxes like torchvision's FCOS, except at the end of a range.
 
-    A point takes the smallest box around it whose centre is within ``radius`` strides of the point along both
-    axes, and whose farthest side is at a distance within the point's range (low, high), in pixels.
+    A point takes the smallest box around it whose centre is less than ``radius`` strides away along both axes, and
+    whose farthest side is at a distance in the point's range, more than its low and at most its high end, in pixels.
+    (torchvision excludes both ends, so that a distance between two ranges belongs to neither level. Boxes of rendered
+    masks have whole pixels, and such distances.)
 
     Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding.
 
@@ -109,7 +111,7 @@ def assign_points(
         centres = 0.5 * (corners[..., :2] + corners[..., 2:])
         near = (points - centres).abs().amax(-1) < radius * strides
         farthest = distances.amax(-1)
-        found = near & (distances.amin(-1) > 0) & (farthest > ranges[:, 0]) & (farthest < ranges[:, 1])
+        found = near & (distances.amin(-1) > 0) & (farthest > ranges[:, 0]) & (farthest <= ranges[:, 1])
         areas = (corners[..., 2:] - corners[..., :2]).prod(-1)
         smallest, match = torch.where(found & present[..., None], areas, torch.inf).min(1)
         foreground = smallest < torch.inf
