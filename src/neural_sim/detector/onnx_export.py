@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from neural_sim.detector.saved_detector import SavedDetector
+from neural_sim.documents import write_whole
 from neural_sim.extras import require
 
 OPSET = 18
@@ -54,13 +54,9 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
     ``class_names`` as JSON.
 
     Raises:
-        ValueError: a package is missing, or the detector cannot decode the boxes of all anchors.
+        ValueError: a package is missing.
     """
     require("onnx", "model.onnx")
-    if not callable(getattr(saved.detector, "decode", None)):
-        raise ValueError(
-            f"model.onnx: want a detector with a method decode(deltas) -> boxes in pixels, {saved.make} has none"
-        )
     import onnx
 
     height, width = saved.image_size
@@ -79,11 +75,7 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
     model.metadata_props.clear()
     onnx.helper.set_model_props(model, {"class_names": json.dumps(saved.class_names)})
     onnx.checker.check_model(model, full_check=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.part")
-    onnx.save(model, draft)
-    os.replace(draft, path)
-    return path
+    return write_whole(path, model.SerializeToString())
 
 
 @torch.no_grad()
@@ -91,22 +83,21 @@ def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "
     """Compare torch with onnxruntime, on an ONNX file exported without non-maximum suppression.
 
     Returns:
-        The largest difference of scores, and of boxes as fractions of the image's longer side.
+        The largest difference of scores, and of boxes as fractions of the image's longer side; nan if an output is.
     """
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    network, largest = Decoded(saved), 0.0
+    network, differences = Decoded(saved), [torch.zeros(())]
     for chunk in images.split(16):
         given = chunk.float().cpu()
         boxes, scores = (torch.from_numpy(out) for out in session.run(None, {"images": given.numpy()}))
         wanted_boxes, wanted_scores = network(given)
-        for difference, unit in (
-            (boxes - wanted_boxes, max(saved.image_size)),
-            (scores - wanted_scores, 1.0),
-        ):
-            largest = max(largest, float(difference.abs().max()) / unit)
-    return largest
+        differences += [
+            (boxes - wanted_boxes).abs().max() / max(saved.image_size),
+            (scores - wanted_scores).abs().max(),
+        ]
+    return float(torch.stack(differences).max())
 
 
 @contextmanager
