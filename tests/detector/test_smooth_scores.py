@@ -9,7 +9,15 @@ from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.metrics import AveragePrecision, evaluate, mean_of, of_document
 from neural_sim.detector.protocol import Best
 from neural_sim.detector.settings import Backbone
-from neural_sim.detector.smooth_scores import THRESHOLDS, Ranked, SmoothAccuracy, SmoothAP, overlap, ranked
+from neural_sim.detector.smooth_scores import (
+    THRESHOLDS,
+    Ranked,
+    SmoothAccuracy,
+    SmoothAP,
+    nearest_box,
+    overlap,
+    ranked,
+)
 from neural_sim.types import LabelledImages
 
 SHARP = SmoothAP(temperature=1e-6, width=1e-6)
@@ -90,6 +98,16 @@ def test_overlap_is_torchvisions():
     corners = torch.rand(2, 50, 2, generator=generator, dtype=torch.float64) * 20
     boxes = torch.cat([corners, corners + 1 + 10 * torch.rand(2, 50, 2, generator=generator)], -1)
     torch.testing.assert_close(overlap(boxes[0], boxes[1]), box_iou(boxes[0], boxes[1]).diagonal())
+
+
+def test_a_detection_that_touches_no_box_still_has_one_of_its_class_as_the_nearest():
+    """The image's first row is another class's box; a detection far from all boxes must not be matched to it."""
+    boxes = torch.tensor([[40.0, 40, 50, 50], [0, 0, 10, 10], [70, 70, 80, 80]])
+    truth = torch.tensor([[0.0, 0, 10, 10], [40, 40, 50, 50]]).expand(3, 2, 4)
+    overlaps, which = nearest_box(boxes, truth, torch.tensor([[False, True]]).expand(3, 2))
+    assert overlaps.tolist() == [1.0, 0.0, 0.0] and which.tolist() == [1, 1, 1]
+    overlaps, which = nearest_box(boxes, truth, torch.zeros(3, 2, dtype=torch.bool))
+    assert overlaps.tolist() == [0.0] * 3 and which.tolist() == [-1] * 3
 
 
 def scattered(generator: torch.Generator, count: int) -> tuple[LabelledImages, Best, list[dict]]:

@@ -128,12 +128,13 @@ def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_cla
 def nearest_box(
     boxes: Float[Tensor, "m 4"], truth: Float[Tensor, "m boxes 4"], present: Bool[Tensor, "m boxes"]
 ) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"]]:
-    """Find each detection's largest intersection over union with a box of its image, and that box; 0, -1 for none."""
+    """Find each detection's largest intersection over union with a ``present`` box, and that box; 0, -1 if none is."""
     if truth.shape[1] == 0:
         return boxes.new_zeros(len(boxes)), torch.full_like(boxes[:, 0], -1, dtype=torch.long)
-    overlaps = torch.where(present, overlap(boxes[:, None], truth), 0.0)
+    # Below every overlap, so that a detection that touches no box is not matched to a row without one.
+    overlaps = torch.where(present, overlap(boxes[:, None], truth), -1.0)
     best, which = overlaps.max(1)
-    return best, torch.where(present.any(1), which, -1)
+    return best.clamp_min(0.0), torch.where(present.any(1), which, -1)
 
 
 def overlap(a: Float[Tensor, "*#n 4"], b: Float[Tensor, "*#n 4"]) -> Float[Tensor, "..."]:
