@@ -73,6 +73,18 @@ def test_focal_loss_is_torchvisions(generator):
     )
 
 
+@pytest.mark.parametrize("gamma", [0.5, 1.5])
+def test_derivatives_with_a_fractional_gamma_are_finite_far_out(gamma):
+    """The probability of a miss rounds to 0 there, where a power of it has an infinite derivative."""
+    logits = torch.tensor([-200.0, 200.0, 0.3], requires_grad=True)
+    wanted = torch.tensor([0.0, 1.0, 1.0])
+    loss = focal_loss(logits, wanted, 0.25, gamma)
+    torch.testing.assert_close(loss, sigmoid_focal_loss(logits, wanted, 0.25, gamma))
+    (slope,) = torch.autograd.grad(loss.sum(), logits, create_graph=True)
+    (bend,) = torch.autograd.grad(slope.sum(), logits)
+    assert bool(slope.isfinite().all()) and bool(bend.isfinite().all())
+
+
 def test_focal_loss_is_finite_far_out():
     logits = torch.tensor([-1e4, 1e4, -1e4, 1e4], dtype=torch.float64, requires_grad=True)
     wanted = torch.tensor([0.0, 1.0, 1.0, 0.0], dtype=torch.float64)

@@ -146,9 +146,12 @@ def focal_loss(
     """
     sign = 2 * targets - 1
     cross_entropy = F.softplus(-sign * logits)
-    miss = torch.sigmoid(-sign * logits)
+    if float(gamma).is_integer():
+        damped = torch.sigmoid(-sign * logits) ** gamma
+    else:  # where the sigmoid rounds to 0, a fractional power of it has infinite derivatives
+        damped = torch.exp(-gamma * F.softplus(sign * logits))
     alpha_t = alpha * targets + (1 - alpha) * (1 - targets)
-    return alpha_t * miss**gamma * cross_entropy
+    return alpha_t * damped * cross_entropy
 
 
 def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Float[Tensor, "*shape"]:
