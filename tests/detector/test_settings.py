@@ -29,6 +29,7 @@ CASES = [
     (Anchors, {"sizes": ((8,),)}, "Anchors.sizes: want one list for each stride, all of them equally long"),
     (Anchors, {"sizes": ((8,), (16, 24))}, "Anchors.sizes: want one list for each stride"),
     (Anchors, {"sizes": ((8,), (0,))}, "Anchors.sizes[1][0]: want more than 0"),
+    (Anchors, {"strides": (), "sizes": ()}, "Anchors.strides: want 1 or more values"),
     (Anchors, {"foreground_iou": 0.3}, "Anchors.foreground_iou: want at least background_iou=0.4, got 0.3"),
     (Points, {**THREE, "limits": (20, 10)}, "Points.limits: want increasing values, got [20, 10]"),
     (Points, {**THREE, "limits": (10, 10)}, "Points.limits: want increasing values"),

@@ -85,7 +85,7 @@ class Anchors:
         foreground_iou, background_iou: overlaps from which an anchor is foreground, and below which it is background.
     """
 
-    strides: Sequence[PositiveInt] = (8, 16)
+    strides: Annotated[Sequence[PositiveInt], MinLen(1)] = (8, 16)
     sizes: Sequence[Annotated[Sequence[Positive], MinLen(1)]] = ((22, 28, 36), (46, 58, 74))
     reference: Positive | None = 96
     ratios: Annotated[Sequence[Positive], MinLen(1)] = (1.0,)
