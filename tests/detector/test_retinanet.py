@@ -1,3 +1,5 @@
+from urllib.error import URLError
+
 import pytest
 import torch
 from torch import nn
@@ -177,6 +179,27 @@ def test_default_tiny_is_small(generator):
 def test_bad_settings_are_named(tools, changes, message):
     with pytest.raises(ValueError, match=message):
         tools.detector(**changes)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"t", b"PK\x03\x04", b"\x80\x02X\x01\x00\x00\x00\xff", b"\x80\x02("]
+)
+def test_a_broken_file_of_weights_is_one_line(tools, tmp_path, content):
+    (tmp_path / "weights.pth").write_bytes(content)
+    backbone = {"architecture": "resnet18", "weights": str(tmp_path / "weights.pth")}
+    with pytest.raises(ValueError, match=r"^detector\.backbone\.weights: .* is not a torch\.save file"):
+        tools.detector(backbone)
+
+
+def test_weights_that_cannot_be_downloaded_are_one_line(tools, monkeypatch):
+    def offline(*_, **__):
+        raise URLError("no network")
+
+    monkeypatch.setattr("neural_sim.detector.network.get_model", offline)
+    with pytest.raises(
+        ValueError, match=r"^detector\.backbone\.weights: DEFAULT cannot be downloaded \(.*no network"
+    ):
+        tools.detector({"architecture": "resnet18", "weights": "DEFAULT"})
 
 
 def test_wrong_image_size_is_refused(tools, generator):

@@ -8,7 +8,6 @@ global one.
 from __future__ import annotations
 
 import math
-import pickle
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -85,11 +84,11 @@ PLANS = {
 
 
 class Stages(nn.Module):
-    """A sequence of modules, some of which end a stage; the maps at ``strides`` are the backbone's output.
+    """A sequence of modules, some of which end a stage; the maps at ``strides`` (ascending) are the backbone's output.
 
-    ``children`` are registered under the attribute name ``under``, which becomes part of their parameter names.
-    ``ends`` maps each module that ends a stage to its stride, from fine to coarse. ``channels`` maps strides to numbers
-    of channels.
+    ``children`` are registered under the attribute name ``under``, which becomes part of their parameter names. Those
+    after the last of the strides are left out. ``ends`` maps each module that ends a stage to its stride, from fine to
+    coarse. ``channels`` maps strides to numbers of channels.
     """
 
     def __init__(
@@ -101,8 +100,11 @@ class Stages(nn.Module):
         channels: Mapping[int, int],
     ) -> None:
         super().__init__()
-        self._under, self._ends, self.strides, self.channels = under, dict(ends), strides, dict(channels)
-        self.add_module(under, nn.ModuleDict(children))
+        self._ends = {name: stride for name, stride in ends.items() if stride <= strides[-1]}
+        names = list(children)
+        used = names[: names.index(list(self._ends)[-1]) + 1]
+        self._under, self.strides, self.channels = under, strides, dict(channels)
+        self.add_module(under, nn.ModuleDict({name: children[name] for name in used}))
 
     @override
     def forward(self, x: Float[Tensor, "n c h w"]) -> tuple[Tensor, ...]:
@@ -210,7 +212,9 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
     if Path(weights).is_file():
         try:
             state = torch.load(weights, map_location="cpu", weights_only=True)
-        except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+        except OSError as error:
+            raise ValueError(f"detector.backbone.weights: {weights} cannot be read ({error})") from error
+        except Exception as error:  # on a broken file, torch's reader fails wherever the bytes lead it
             raise ValueError(f"detector.backbone.weights: {weights} is not a torch.save file") from error
         if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
             raise ValueError(f"detector.backbone.weights: {weights} holds no state dictionary")
@@ -218,7 +222,12 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
         names = list(get_model_weights(architecture).__members__)
         if weights not in (*names, "DEFAULT"):
             raise ValueError(f"detector.backbone.weights: want a file or one of {names}, got {weights!r}")
-        state = get_model(architecture, weights=weights).state_dict()
+        try:
+            state = get_model(architecture, weights=weights).state_dict()
+        except OSError as error:
+            raise ValueError(
+                f"detector.backbone.weights: {weights} cannot be downloaded ({error}); want the path of a file"
+            ) from error
     state = {k: v for k, v in state.items() if not k.startswith("fc.") and "num_batches" not in k}
     template = get_model(architecture).state_dict()
     wanted = {k: v.shape for k, v in template.items() if not k.startswith("fc.") and "num_batches" not in k}
