@@ -5,6 +5,8 @@ import torch
 from torchvision.models import resnet18
 
 from neural_sim.detector.cached_set import CachedSet, cached_features
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Backbone, Head
 from neural_sim.detector.training import DetectorModule, Optimisation, train_detector
 from neural_sim.types import LabelledImages
 
@@ -127,6 +129,45 @@ def test_a_proximal_term_holds_training_at_its_anchor(tools, generator, images):
         return math.sqrt(sum(float((trained[n] - start[n]).square().sum()) for n in start))
 
     assert distance(100.0) < 0.1 * distance(1.0) < 0.1 * distance(0.0)
+
+
+class Bare(RetinaNet):
+    """No parameter's name begins with ``backbone.``, and the features are the images."""
+
+    def init(self, generator):
+        return {name.replace("backbone.", "body."): value for name, value in super().init(generator).items()}
+
+    def learnable(self, params):
+        return list(params)
+
+    def features(self, backbone, images):
+        return (images,)
+
+    def outputs(self, trainable, features):
+        named = {name.replace("body.", "backbone."): value for name, value in trainable.items()}
+        backbone, rest = self.split(named)
+        return super().outputs(rest, super().features(backbone, features[0]))
+
+
+def test_a_detector_without_a_backbone_trains(generator, images):
+    detector = Bare(3, 32, Backbone("micro"), Head(8, 1))
+    start = detector.init(generator)
+    trained, _ = train(detector, start, images)
+    assert all(not torch.equal(trained[name], start[name]) for name in start)
+
+
+def test_what_is_not_learnable_stays_even_if_the_backbone_is_frozen(tools, generator, images):
+    detector, names = tools.detector(), []
+
+    def learnable(params):
+        return names
+
+    detector.learnable = learnable
+    start = detector.init(generator)
+    head = [name for name in start if name.startswith("head.")]
+    for names in (head, [*head, *detector.split(start)[0]]):
+        trained, _ = train(detector, start, images)
+        assert {name for name in start if not torch.equal(trained[name], start[name])} == set(names)
 
 
 def test_a_detector_may_keep_its_weights_in_every_training(tools, generator, images, tmp_path):

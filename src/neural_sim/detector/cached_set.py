@@ -20,14 +20,15 @@ def cached_features(
 ) -> tuple[Tensor, ...]:
     """Compute feature maps [n, channels, height, width] of images [n, 3, H, W] in [0, 1], one tensor for each level.
 
-    They are computed batch by batch on the backbone's device, without an autograd graph.
+    They are computed batch by batch on the backbone's device (the images', if it has no parameters), without an
+    autograd graph.
 
     Raises:
         ValueError: there are no images (for instance, an empty target set), so the mean loss is undefined.
     """
     if len(images) == 0:
         raise ValueError("cached_features: got no images, want at least one")
-    device = next(iter(backbone.values())).device
+    device = next((value.device for value in backbone.values()), images.device)
     parts = [detector.features(backbone, chunk.to(device)) for chunk in images.split(batch_size)]
     return tuple(torch.cat(level) for level in zip(*parts, strict=True))
 

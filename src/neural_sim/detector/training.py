@@ -317,16 +317,17 @@ def train_detector(
     """
     if len(images) == 0:
         raise ValueError("train_detector: got no images, want at least one")
-    fixed, learned = detector.split(params)
-    names = set(detector.learnable(params))
-    if not names & set(fixed) and not isinstance(images, CachedSet):
-        images = CachedSet.of(detector, fixed, images)
+    backbone, predictor = detector.split(params)
+    # In the psi loop, which passes features, all that follows the features is trained.
+    names = set(predictor) if isinstance(images, CachedSet) else set(detector.learnable(params))
+    if not names & set(backbone) and not isinstance(images, CachedSet):
+        images = CachedSet.of(detector, backbone, images)
     if isinstance(images, CachedSet):
         inputs, targets = images.features, images.targets
     else:
-        learned = {name: value for name, value in params.items() if name in names}
-        fixed = {name: value for name, value in params.items() if name not in names}
         inputs, targets = (images.images,), detector.assign(images.boxes, images.labels)
+    learned = {name: value for name, value in params.items() if name in names}
+    fixed = {name: value for name, value in params.items() if name not in names}
     batches = Batches(inputs, targets, how.batch_size, generator, sampling)
     module = DetectorModule(detector, learned, fixed, how, how.epochs * len(batches), anchor, recording)
     _fit(module, batches, next(iter(learned.values())).device)
