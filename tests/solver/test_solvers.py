@@ -12,7 +12,7 @@ import torch
 
 from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.direct import Identity
+from neural_sim.solver.direct import Exact, Identity
 from neural_sim.solver.minres import MinimumResidual
 
 DOUBLE = torch.float64
@@ -80,6 +80,26 @@ def test_warm_start_is_used_or_dropped(symmetric, right_hand_side, spread):
             dropped = solver.solve(lambda v: matrix @ v, b, x0=useless, rtol=1e-4, max_steps=900)
             assert not dropped.warm_started
             torch.testing.assert_close(dropped.value, cold.value)
+
+
+@pytest.mark.parametrize(("solver", "products"), [(Identity(), 1), (Exact(), SIZE + 1)])
+def test_direct_solvers_take_no_start_and_spend_no_product_on_it(
+    solver, products, symmetric, right_hand_side, spread
+):
+    matrix, b = symmetric(spread(1e2)), right_hand_side()
+    close = torch.linalg.solve(matrix, b) * (1 + 1e-3)
+    found = solver.solve(lambda v: matrix @ v, b, x0=close)
+    assert not found.warm_started and found.products == products
+
+
+def test_minres_spends_one_product_a_step_and_one_on_the_residual(symmetric, right_hand_side, spread):
+    matrix, b = symmetric(spread(1e2)), right_hand_side()
+    found = MinimumResidual().solve(lambda v: matrix @ v, b, rtol=1e-6, max_steps=900)
+    assert found.status is Status.CONVERGED and found.products == found.steps + 1
+    assert found.residual == pytest.approx(float((b - matrix @ found.value).norm() / b.norm()), rel=1e-6)
+    spent = MinimumResidual().solve(lambda v: matrix @ v, b, rtol=1e-6, max_steps=5)
+    assert spent.status is Status.MAX_STEPS and spent.products == spent.steps + 1 == 6
+    assert spent.residual == pytest.approx(float((b - matrix @ spent.value).norm() / b.norm()), rel=1e-6)
 
 
 def test_best_iterate_is_kept(symmetric, right_hand_side, spread):

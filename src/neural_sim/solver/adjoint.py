@@ -16,6 +16,7 @@ from neural_sim.ranges import NonNegativeInt, PositiveInt, validated
 from neural_sim.solver.base import LinearSolver, Solution, Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import Damped, Damping, LanczosDamping
+from neural_sim.solver.direct import Identity
 from neural_sim.solver.hvp import HessianOperator, Mode, Term
 from neural_sim.solver.operator import Matvec, Shifted
 
@@ -48,10 +49,10 @@ class AdjointSolver:
 
     Args:
         linear: the linear solver.
-        damping: the choice of lambda.
+        damping: the choice of lambda; ``Identity`` takes none, so that its lambda is 0.
         mode: how Hessian products are computed, see ``HessianOperator``.
         rtol, max_steps: passed to the linear solver.
-        retain_graph: keep the graph of the first gradient between products: faster, but with all chunks in memory.
+        retain_graph: see ``HessianOperator``.
         max_raises: limit on the increases of lambda after negative curvature was met (a fixed lambda is never raised).
         sensitivity: also solve at 2 lambda, to measure the influence of the damping; costs about one more solve.
     """
@@ -73,9 +74,14 @@ class AdjointSolver:
         x0: Float[Tensor, "n"] | None,
         generator: torch.Generator,
     ) -> Adjoint:
-        """Solve for the right-hand side ``b``, warm-started from ``x0``; ``generator`` draws a Lanczos start."""
+        """Solve for the right-hand side ``b``, warm-started from ``x0``.
+
+        ``generator`` draws the start vector of the damping's estimate, if that does not start from ``b``.
+        """
         operator = self.operator(terms, params)
-        damped = self.damping.choose(operator, b, generator)
+        # A multiple of b does not depend on lambda, which would take products to choose.
+        plain = isinstance(self.linear, Identity)
+        damped = Damped(0.0, None) if plain else self.damping.choose(operator, b, generator)
         solution = self._solve(operator, damped, b, x0)
         damping_raises = 0
         while solution.status is Status.NEGATIVE_CURVATURE and damping_raises < self.max_raises:
@@ -94,10 +100,7 @@ class AdjointSolver:
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
     ) -> Solution:
-        """Solve with lambda multiplied by ``times``.
-
-        Starts from the damping's Krylov search or, without one, from ``x0``.
-        """
+        """Solve with lambda multiplied by ``times``, from the damping's Krylov search or, without one, from ``x0``."""
         searched = damped.search(times)
         start = x0 if searched is None else searched
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)

@@ -7,7 +7,7 @@ import enum
 import logging
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Gt, Lt
@@ -17,7 +17,7 @@ from torch import Tensor
 from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, norm
 
 RestartGain = Annotated[float, Gt(0), Lt(1)]
-"""The factor by which a restart must shrink the residual."""
+"""The largest fraction of the residual that a restart may leave."""
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class Status(enum.Enum):
     STAGNATED = "residual stopped falling: the limit of this arithmetic, raise damping or precision"
     NEGATIVE_CURVATURE = "operator is not positive definite: raise damping"
     LEAST_SQUARES = "singular and inconsistent: the value minimises the residual, which cannot vanish"
-    SINGULAR = "operator is singular to rounding: the value is the minimum-norm solution on its range"
+    SINGULAR = "operator is singular up to rounding: the value is the minimum-norm solution on its range"
     NON_FINITE = "operator, right-hand side or solution is not finite"
 
 
@@ -40,11 +40,11 @@ class Solution:
     """Result of ``A x = b``; every field is finite whatever the inputs were.
 
     ``residual`` is ``|b - A x| / |b|``, computed from a fresh product, never taken from the recurrence. Rescaling A or
-    b does not change it. It is 0 for b = 0, and 1 if nothing finite was found and ``value`` is zero. Only an
+    b does not change it. It is 0 for b = 0, and 1 if nothing finite was found, in which case ``value`` is zero. Only an
     APPROXIMATE value may have a residual above 1. ``curvature`` is the smallest and largest Rayleigh quotient
     ``p^T A p / p^T p`` of all products (0, 0 if none). ``products`` counts all applications of A, ``steps`` the
-    solver's own iterations. ``warm_started`` says whether x0 was used (it is dropped if its residual is no better than
-    that of zero).
+    solver's own iterations. ``warm_started`` says whether the solver began at x0 (which is dropped unless its residual
+    is below that of zero).
     """
 
     value: Float[Tensor, "n"]
@@ -73,8 +73,8 @@ class Iterate:
 class Search:
     """State of a conjugate-gradient search, from which the search can continue.
 
-    ``residual`` is ``b - A value`` by the recurrence, ``direction`` the next search direction. Solvers other than
-    conjugate gradients use only the iterate, ``value``.
+    ``residual`` is ``b - A value`` by the recurrence, ``direction`` the next search direction, which only conjugate
+    gradients use.
     """
 
     value: Float[Tensor, "n"]
@@ -82,7 +82,7 @@ class Search:
     direction: Float[Tensor, "n"]
 
     def divided(self, scale: float) -> Search:
-        """Divide the right-hand side, and with it the whole state, by ``scale``."""
+        """Return the state of the search for a right-hand side divided by ``scale``."""
         return Search(self.value / scale, self.residual / scale, self.direction / scale)
 
 
@@ -105,7 +105,12 @@ class System:
 
 @dataclass(frozen=True)
 class LinearSolver(abc.ABC):
-    """Solves ``A x = b`` for symmetric A, given by its products. Subclasses hold typed hyper-parameters."""
+    """Solves ``A x = b`` for symmetric A, given by its products. Subclasses hold typed hyper-parameters.
+
+    ``iterative`` is False for solvers whose result does not depend on where they start.
+    """
+
+    iterative: ClassVar[bool] = True
 
     @property
     def largest(self) -> int | None:
@@ -129,7 +134,7 @@ class LinearSolver(abc.ABC):
         Args:
             matvec: products with A.
             b: the right-hand side.
-            x0: where to start: a vector, or a search to continue; None: zero.
+            x0: where to start: a vector, or a search to continue; None: zero. Ignored by solvers that do not iterate.
             rtol: relative residual at which to stop.
             max_steps: step limit; the cost of a step depends on the solver.
 
@@ -148,12 +153,13 @@ class LinearSolver(abc.ABC):
         if not bool(torch.isfinite(b).all()):
             return failed
         scale = _power_of_two(scale)
-        rhs = b / scale  # the norm of b itself would overflow float32 at 1e20 and underflow at 1e-30
+        rhs = b / scale  # so that products stay within the range of float32, whatever the unit of b
         unit = _power_of_two(norm(rhs))
         rhs = rhs / unit
         size = norm(rhs)
         try:
-            system = _started(operator, rhs, _scaled(x0, scale, unit), rtol * size, max_steps)
+            guess = _scaled(x0, scale, unit) if self.iterative else None
+            system = _started(operator, rhs, guess, rtol * size, max_steps)
             end = self.iterate(system)
             reached = norm(rhs - operator(end.value)) if end.residual is None else end.residual
             residual = reached / size
@@ -177,7 +183,7 @@ class LinearSolver(abc.ABC):
 
 
 def _verified(claimed: Status, residual: float, rtol: float) -> Status:
-    """Downgrade a claimed status to what the recomputed residual supports."""
+    """Replace a claimed status by what the recomputed residual shows."""
     if residual <= rtol and claimed is not Status.SINGULAR:
         return Status.CONVERGED
     return Status.STAGNATED if claimed is Status.CONVERGED else claimed

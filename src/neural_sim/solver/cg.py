@@ -17,8 +17,8 @@ from neural_sim.solver.operator import dot, in_range, norm, numbers, plain_dot, 
 class ConjugateGradient(LinearSolver):
     """Conjugate gradients, for positive definite operators.
 
-    ``restart_gain``: when the recursion's residual has converged and the recomputed one has not, the iteration restarts
-    from the recomputed residual, as long as each restart shrinks it by this factor.
+    ``restart_gain``: when the recurrence's residual has converged and the recomputed one has not, the iteration
+    restarts from the recomputed one, as long as each restart leaves at most this fraction of it.
     """
 
     restart_gain: RestartGain = 0.5

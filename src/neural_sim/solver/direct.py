@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -25,6 +25,7 @@ class Exact(LinearSolver):
     as the curvature. ``max_steps`` does not apply. Systems above ``max_size`` raise ``ValueError``.
     """
 
+    iterative: ClassVar[bool] = False
     max_size: PositiveInt = 5000
 
     @property
@@ -76,6 +77,7 @@ def _refined(
 class Identity(LinearSolver):
     """``x = scale b``, the one-step choice T1-T2 (Luketina et al. 2016). One product is spent on the residual."""
 
+    iterative: ClassVar[bool] = False
     scale: Annotated[float, Matching(bool, "a number other than 0")] = 1.0
 
     @override

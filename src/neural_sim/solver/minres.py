@@ -21,7 +21,7 @@ class MinimumResidual(LinearSolver):
     """The minimum residual method (MINRES), for any symmetric operator.
 
     The residual falls monotonically. On an inconsistent singular system the method ends at a least-squares solution and
-    says so. ``restart_gain`` as in ``ConjugateGradient``.
+    says so. For ``restart_gain`` see ``ConjugateGradient``.
     """
 
     restart_gain: RestartGain = 0.5
@@ -34,7 +34,7 @@ class MinimumResidual(LinearSolver):
         size = norm(residual)
         while size > tolerance:
             if steps >= system.max_steps:
-                return Iterate(value, Status.MAX_STEPS, steps)
+                return Iterate(value, Status.MAX_STEPS, steps, size)
             cycle = _cycle(operator, residual, tolerance, system.max_steps - steps)
             steps += cycle.steps
             candidate = value + cycle.value
@@ -44,13 +44,15 @@ class MinimumResidual(LinearSolver):
                 least = value + cycle.least
                 left = rhs - operator(least)
                 if norm(left) > tolerance and _minimises(operator, left):
-                    return Iterate(least, Status.LEAST_SQUARES, steps)
+                    return Iterate(least, Status.LEAST_SQUARES, steps, norm(left))
                 if norm(left) < reached:
                     candidate, after, reached = least, left, norm(left)
             if reached > max(tolerance, (self.restart_gain if cycle.converged else 1.0) * size):
-                return Iterate(candidate if reached < size else value, Status.STAGNATED, steps)
+                if reached < size:
+                    return Iterate(candidate, Status.STAGNATED, steps, reached)
+                return Iterate(value, Status.STAGNATED, steps)
             value, residual, size = candidate, after, reached
-        return Iterate(value, Status.CONVERGED, steps)
+        return Iterate(value, Status.CONVERGED, steps, size)
 
 
 def _minimises(operator: Watched, residual: Float[Tensor, "n"]) -> bool:
@@ -92,8 +94,8 @@ def _cycle(operator: Watched, residual: Float[Tensor, "n"], tolerance: float, bu
         carried = cosine_before * beta
         diagonal = cosine * alpha - sine * carried
         upper, upper_two = cosine * carried + sine * alpha, sine_before * beta
-        # |A r| / |r| of the iterate so far (Choi, Paige and Saunders 2011). Where it nearly vanishes, the rest of the
-        # right-hand side lies outside the range or on eigenvalues below half the digits; more steps tell which.
+        # |A r| / |r| of the iterate so far (Choi, Paige and Saunders 2011). Where it nearly vanishes, the residual lies
+        # outside the range of A, or along eigenvalues below sqrt(eps) |A|; more steps tell which.
         slope = math.hypot(diagonal, cosine * beta_next) / largest if largest > 0.0 else 0.0
         if slope <= min(half_digits, lowest):
             least, least_norm, lowest = value, abs(eta), slope

@@ -65,7 +65,7 @@ def numbers(*scalars: Shaped[Tensor, ""]) -> list[float]:
 
 
 def plain_norm(vector: Tensor) -> Float[Tensor, ""]:
-    """Compute the Euclidean norm in float64, whose range holds float32 squares; it stays on the device."""
+    """Compute the Euclidean norm in float64, in whose range squares of float32 numbers lie; it stays on the device."""
     return cast(Tensor, torch.linalg.vector_norm(vector, dtype=torch.float64))  # pyright: ignore[reportUnknownMemberType]
 
 
