@@ -12,7 +12,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 import torch
 
@@ -26,7 +26,6 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.graph import Psi
 from neural_sim.studies.frozen_loop import FrozenLoop
 from neural_sim.tasks.context import Context
-from neural_sim.tasks.report import run_results
 from neural_sim.types import PosedViews
 
 T = TypeVar("T")
@@ -236,18 +235,6 @@ class World:
     def outer(self) -> Outer:
         """The psi loop's settings."""
         return self.context.experiment.loop.outer
-
-    @property
-    def uri(self) -> str:
-        """The MLflow store's address."""
-        return self.context.uri
-
-    @property
-    def results(self) -> Mapping[str, Any]:
-        """The content of the run's own results.json, after its psi loop and evaluation."""
-        graph, results = self.context.graph, self.context.results
-        scores = {name: results(stage) for name, stage in graph.compared(results(graph.learned)).items()}
-        return run_results(self.context, scores, symmetric=False).document()
 
     @property
     def visited(self) -> Mapping[str, Psi]:

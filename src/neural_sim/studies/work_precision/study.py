@@ -16,11 +16,9 @@ from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.provenance import machine
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Stage
-from neural_sim.studies.work_precision.derivative import Derivative
 from neural_sim.studies.work_precision.estimator import Estimators
 from neural_sim.studies.work_precision.field import Fields
 from neural_sim.studies.work_precision.hypergradient import Hypergradients
-from neural_sim.studies.work_precision.loop import Loops
 from neural_sim.studies.work_precision.measurement import Clock, Family, Series, Timing, World
 from neural_sim.studies.work_precision.quadrature import Quadrature
 from neural_sim.studies.work_precision.renderer import Renderer
@@ -29,9 +27,7 @@ from neural_sim.studies.work_precision.solver import Solver
 from neural_sim.tasks.context import Context, Task
 
 _log = logging.getLogger(__name__)
-Name = Literal[
-    "quadrature", "renderer", "field", "solver", "hypergradient", "estimator", "derivative", "loop"
-]  # fmt: skip
+Name = Literal["quadrature", "renderer", "field", "solver", "hypergradient", "estimator"]
 FAMILIES: tuple[Name, ...] = get_args(Name)
 """Families in the order of the psi loop; each is a key of the settings."""
 COMMAND = "python -m src.main +experiment=work_precision"
@@ -41,8 +37,6 @@ READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
     "field": lambda graph: graph.views,
     "hypergradient": lambda graph: [graph.warm_start, graph.targets],
     "estimator": lambda graph: [graph.warm_start, graph.targets],
-    "derivative": lambda graph: graph.fields,
-    "loop": lambda graph: [graph.learned, graph.targets],
 }
 """Stages that each family reads."""
 
@@ -63,8 +57,6 @@ class WorkPrecision(Task):
         solver: likewise.
         hypergradient: likewise.
         estimator: likewise.
-        derivative: likewise.
-        loop: likewise.
     """
 
     families: Annotated[Sequence[Name], MinLen(1)] = FAMILIES
@@ -77,8 +69,6 @@ class WorkPrecision(Task):
     solver: Solver = field(default_factory=Solver)
     hypergradient: Hypergradients = field(default_factory=Hypergradients)
     estimator: Estimators = field(default_factory=Estimators)
-    derivative: Derivative = field(default_factory=Derivative)
-    loop: Loops = field(default_factory=Loops)
 
     @property
     def timing(self) -> Timing:
