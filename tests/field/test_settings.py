@@ -28,11 +28,6 @@ CASES = [
     (GRID, {"resolution": 64}, "GridFitting.resolution: want at least 32 after halving it 2 times, got 64"),
     (GRID, {"refine_steps": (0,)}, "GridFitting.refine_steps[0]: want at least 1"),
     (partial(AppearanceFitting, AppearanceField(), GridFitting), {"anchors": 0}, "AppearanceFitting.anchors: want"),
-    (
-        partial(AppearanceFitting, AppearanceField(), GridFitting),
-        {"transient_penalty": -1.0},
-        "AppearanceFitting.transient_penalty: want at least 0",
-    ),
     (RECIPE, {"steps": 0}, "FieldRecipe.steps: want at least 1"),
     (RECIPE, {"final_rate": 0.0}, "FieldRecipe.final_rate: want more than 0 and at most 1"),
     (SceneMasks, {"resolution": 98}, "SceneMasks.resolution: want at least 16 and a multiple of 4, got 98"),

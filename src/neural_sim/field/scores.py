@@ -24,14 +24,9 @@ def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Flo
     With d the error of premultiplied colour, a that of opacity and b the background, the pixel's error is d - a b;
     E b = 1/2 and E b^2 = 1/3. ``pixels`` are premultiplied RGBA.
     """
-    return expected_errors(rendering, pixels).mean()
-
-
-def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, "rays 3"]:
-    """Return the expected squared error of each ray and channel; ``expected_error`` is their mean."""
     colour = rendering[0] - pixels[:, :3]
     opacity = (rendering[1] - pixels[:, 3])[:, None]
-    return colour.square() - colour * opacity + opacity.square() / 3.0
+    return (colour.square() - colour * opacity + opacity.square() / 3.0).mean()
 
 
 def score_views(
