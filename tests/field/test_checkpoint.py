@@ -22,7 +22,7 @@ RECIPES = {
     "grid": FieldRecipe(lambda: GridField(features=4, head_width=4), GRID, STEPS),
     "appearance": FieldRecipe(
         lambda: AppearanceField(head_width=8, code_size=4),
-        lambda field: AppearanceFitting(field, GRID, shared_lights=False, anchors=3),
+        lambda field: AppearanceFitting(field, GRID),
         STEPS,
     ),
     "mlp": FieldRecipe(

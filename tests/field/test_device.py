@@ -46,7 +46,7 @@ def _grid_w(device):
 def _photographs(device):
     """Codes of the views' own, fitted to held-out views too."""
     field = AppearanceField(code_size=4, head_width=8, view_dependent=True).to(device)
-    return AppearanceFitting(field, GRID, shared_lights=False, anchors=2)
+    return AppearanceFitting(field, GRID, anchors=2)
 
 
 def _network(device):

@@ -33,9 +33,6 @@ class AppearanceFitting(Fitting):
 
     Args:
         grid: makes the fitting of the field's grid.
-        shared_lights: if light weights are known, a view's code combines the anchors' codes by its weights, so that the
-            look of a side under one light is learned from all views of that side. Otherwise, and for photographs, each
-            view learns its own code (NeRF in the Wild).
         anchors: number of views, evenly spread, whose codes become the anchors if no light weights are known.
     """
 
@@ -47,13 +44,12 @@ class AppearanceFitting(Fitting):
         grid: Callable[[GridField], GridFitting],
         code_learning_rate: Positive = 0.02,
         head_learning_rate: Positive = 0.03,
-        shared_lights: bool = True,
         anchors: PositiveInt = 6,
     ) -> None:
         self.grid = grid(field.grid)
         super().__init__(field, self.grid.batch_rays)
         self.code_learning_rate, self.head_learning_rate = code_learning_rate, head_learning_rate
-        self.shared_lights, self.anchors = shared_lights, anchors
+        self.anchors = anchors
 
     @override
     def start(self, views: PosedViews, generator: torch.Generator) -> None:
@@ -64,18 +60,19 @@ class AppearanceFitting(Fitting):
     def _codes_of(
         self, views: PosedViews
     ) -> tuple[Float[Tensor, "views learned"], Float[Tensor, "k learned"]]:
-        """Return how each view's code, and each anchor, combines the learned codes."""
+        """Return how each view's code, and each anchor, combines the learned codes.
+
+        If light weights are known, a view's code combines the anchors' codes by its weights, so that the look of a side
+        under one light is learned from all views of that side. Photographs learn a code each (NeRF in the Wild).
+        """
         weights = views.light_weights
-        if weights is not None and self.shared_lights:
-            return weights, torch.eye(weights.shape[1]).to(weights)
-        own = torch.eye(len(views)).to(views.images)
         if weights is not None:
-            # Least squares: the anchors whose mixtures come closest to the views' own codes.
-            return own, torch.linalg.pinv(weights.double()).to(weights)
+            return weights, torch.eye(weights.shape[1]).to(weights)
         if self.anchors > len(views):
             raise ValueError(
                 f"AppearanceFitting.anchors: want at most {len(views)}, the number of views, got {self.anchors}"
             )
+        own = torch.eye(len(views)).to(views.images)
         return own, own[torch.linspace(0, len(views) - 1, self.anchors).long()]
 
     @override
