@@ -8,7 +8,8 @@ The classifier learns from renders of the fields of all objects in the frames, m
     roll known      the renders of `all sides`, crops turned by up to 10 degrees, frames turned by their true roll
 
 A box is right if its most probable bin is the true one or looks the same by symmetry. `--fewest` is the number of boxes
-below which an object is not estimated, 8 by default in runs. `--repeat` counts every frame as often.
+below which an object is not estimated, 8 by default in runs; boxes of near-duplicate frames count as one. `--width` is
+that of the frames in pixels.
 
     python benchmarks/real_frames.py --shared ../shared
 """
@@ -73,6 +74,7 @@ def context_for(options: argparse.Namespace, names: list[str], rho: int) -> Cont
         f"paths.data={options.shared}", f"objects.names=[{','.join(names)}]", f"unlearned.rho_deg=[-{rho},{rho}]",
         "parameter.pose.biased=null", "training.real.mode=none", "target.train_fraction=null",
         f"paths.store={options.out / 'store'}", f"baseline.per_bin={options.per_bin}",
+        f"camera.width={options.width}",
     ]  # fmt: skip
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         return context_of(compose("config", overrides), options.out)[0]
@@ -192,8 +194,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/real_frames"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--per-bin", type=int, default=48)
+    parser.add_argument("--width", type=int, default=160)
     parser.add_argument("--fewest", type=int, default=1)
-    parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES), metavar="CASE")
     options = parser.parse_args()
     options.out, options.shared = options.out.resolve(), options.shared.resolve()
@@ -216,7 +218,6 @@ def main() -> None:
             radii = graph.objects.radii
             size = graph.camera.height, graph.camera.width
             images = target.load(target.reader.names, list(graph.names), *size, distribution, radii)
-        images = images.select(torch.arange(len(images)).repeat(options.repeat))
         settings = LabelShift(fewest=options.fewest, augmentation=Augmentation(roll_deg=turn))
         reader = trained_reader(pool, images, settings, generator)
         groups = groups_of(graph.shown.symmetries, context.results)

@@ -72,7 +72,7 @@ def object_images(
     bound = {}
     for label, (part, rows) in enumerate(zip(rendered.objects, rendered.rows, strict=True)):
         bound[scene.names[label]] = ObjectImages(
-            psi=psi[label].detach().to(part.rgb.dtype),
+            psi=psi[label].detach().to(part.dtype),
             distribution=scene.distribution,
             images=pixels[rows.to(pixels.device)] if part.relaxed else None,
             index=rows,

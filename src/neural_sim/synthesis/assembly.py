@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from neural_sim.parameter.product import RelaxedDraws, SceneNoise
@@ -24,14 +24,15 @@ Compose = Callable[[Float[Tensor, "m h w 3"], Float[Tensor, "m h w"]], LabelledI
 class RenderedObject:
     """m renders of one object alone: premultiplied colour and opacity, and the scene parameters of each render.
 
+    Renders from a pool stay in 8 bits, a quarter of the memory, until ``maps`` are needed to compose images.
     ``noise`` reproduces the draw; it is None if that is not possible, as for pools, probes and pictures. ``relaxed`` is
     None for hard draws. ``tangents``, if rendered, are the maps' derivatives with respect to the named numbers of the
     draw.
     """
 
     draw: SceneDraw
-    rgb: Float[Tensor, "m h w 3"]
-    opacity: Float[Tensor, "m h w"]
+    rgb: Float[Tensor, "m h w 3"] | UInt8[Tensor, "m h w 3"]
+    opacity: Float[Tensor, "m h w"] | UInt8[Tensor, "m h w"]
     noise: SceneNoise | None = None
     relaxed: RelaxedDraws | None = None
     tangents: Mapping[str, Maps] | None = None
@@ -44,6 +45,19 @@ class RenderedObject:
         """Bins of the first binned factor, for reports; -1 if no factor is binned."""
         bins = self.draw.bins
         return bins[:, 0] if bins.shape[1] else torch.full((len(bins),), -1)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Data type of ``maps``."""
+        return self.rgb.dtype if self.rgb.is_floating_point() else torch.float32
+
+    def maps(self, index: Int[Tensor, "k"] | None = None) -> Maps:
+        """Return the maps of some of the renders, None: of all, with values from 0 to 1."""
+        there = slice(None) if index is None else index.to(self.rgb.device)
+        rgb, opacity = self.rgb[there], self.opacity[there]
+        return (
+            Maps(rgb, opacity) if rgb.is_floating_point() else Maps(rgb.float() / 255, opacity.float() / 255)
+        )
 
     def select(self, index: Int[Tensor, "k"]) -> RenderedObject:
         """Return some of the renders, without the fields that reproduce or differentiate them."""
@@ -98,7 +112,8 @@ def one_each(
             return synthesizer.compose(rgb, opacity, nuisance, label, bins)
 
         with torch.no_grad():
-            images.append(again(part.rgb, part.opacity))
+            maps = part.maps()
+            images.append(again(maps.rgb, maps.opacity))
         rows.append(torch.arange(first, first + len(part)))
         compose.append(again)
         first += len(part)
@@ -155,12 +170,13 @@ class Shared:
         labels, place = self.layout.labels[rows], self.place[rows]
         like = self.objects[0]
         size = (*place.shape, *like.opacity.shape[1:])
-        rgb, opacity = like.rgb.new_zeros(*size, 3), like.opacity.new_zeros(size)
+        rgb, opacity = (like.rgb.new_zeros(of, dtype=like.dtype) for of in ((*size, 3), size))
         distance = torch.zeros(place.shape, dtype=torch.float64)
         for label, part in enumerate(self.objects):
             here = labels == label
             index, there = place[here], here.to(rgb.device)
-            rgb[there], opacity[there] = part.rgb[index.to(rgb.device)], part.opacity[index.to(rgb.device)]
+            own = part.maps(index)
+            rgb[there], opacity[there] = own.rgb, own.opacity
             distance[here] = part.draw.distance.detach().double()[index]
         if columns is not None and maps is not None:
             layer = (torch.arange(len(rows), device=rgb.device), columns.to(rgb.device))

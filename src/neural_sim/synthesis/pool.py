@@ -101,7 +101,7 @@ class PooledSubject:
         cell = torch.zeros(len(bins), dtype=torch.long)
         for column, factor in zip(bins.unbind(1), distribution.binned, strict=True):
             cell = cell * factor.bins + column
-        maps = self.maps[cell.to(self.device), within.to(self.device)].float() / 255
+        maps = self.maps[cell.to(self.device), within.to(self.device)]
         return RenderedObject(self.drawn.select(cell * self.per_cell + within), maps[..., :3], maps[..., 3])
 
 
