@@ -14,8 +14,8 @@ from neural_sim.synthesis.layout import Layout
 from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, Maps, SceneDraw
 
-CHUNK = 64
-"""Number of images composed together, which bounds the memory."""
+PIXELS = 2**22
+"""Number of pixels of all layers of the images that are composed together, which bounds the memory."""
 
 Compose = Callable[[Float[Tensor, "m h w 3"], Float[Tensor, "m h w"]], LabelledImages]
 
@@ -153,8 +153,10 @@ class Shared:
     def composed(self) -> RenderedImages:
         """Compose all images."""
         count = range(len(self.objects))
+        high, wide = self.objects[0].opacity.shape[1:]
+        together = max(1, PIXELS // (self.layout.labels.shape[1] * high * wide))
         with torch.no_grad():
-            parts = [self.images(rows) for rows in torch.arange(len(self.layout)).split(CHUNK)]
+            parts = [self.images(rows) for rows in torch.arange(len(self.layout)).split(together)]
         rows = tuple(self.layout.places(label)[0] for label in count)
         return RenderedImages(
             LabelledImages.concatenate(parts),
