@@ -25,7 +25,7 @@ from neural_sim.cameras import reframed
 from neural_sim.field.base import RadianceField
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.renderer.nerf import NerfRenderer, Quality
+from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.provenance import machine
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.export.dataset import ImageFormat, ImageWriter, each
@@ -36,11 +36,11 @@ from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 
-def source_of(fields: dict[str, RadianceField], quality: Quality) -> ImageSource:
+def source_of(fields: dict[str, RadianceField]) -> ImageSource:
     """Return a source of images with uniform poses around the objects, at 2.4 to 4 radii, as in a run."""
     distribution = SceneDistribution.of([Pose()])
     camera = PinholeCamera(96, 96, math.radians(40.0))
-    subjects = tuple(FieldSubject(name, field, NerfRenderer(quality)) for name, field in fields.items())
+    subjects = tuple(FieldSubject(name, field, NerfRenderer()) for name, field in fields.items())
     scene = Scene(subjects, camera, Synthesizer(ProceduralClutter()), distribution)
     psi = torch.zeros(len(fields), distribution.size, dtype=torch.float64)
     return ImageSource(scene, psi, camera, (100.0,) * len(fields), 0)
@@ -99,7 +99,6 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=10)
     parser.add_argument("--sizes", nargs="*", default=["640x480", "1280x960"])
     parser.add_argument("--objects", type=int, nargs="*", default=[1, 6])
-    parser.add_argument("--qualities", nargs="*", default=["final", "draft"])
     parser.add_argument("--workers", type=int, nargs="*", default=[0, 2])
     parser.add_argument("--image-format", choices=["jpg", "png"], default="jpg")
     parser.add_argument("--bop", action="store_true", help="with depth and masks")
@@ -111,27 +110,22 @@ def main() -> None:
         for item in load_objects(arguments.root, arguments.names)
     }
     rows = []
-    print(
-        f"{'size':>10}{'objects':>8} {'quality':8}{'workers':>8}{'images/s':>10}{'cpu s':>8}{'peak MB':>9}{'kB':>7}"
-    )
-    for quality in arguments.qualities:
-        base = source_of(fields, quality)
-        for size in arguments.sizes:
-            width, height = map(int, size.split("x"))
-            for objects in arguments.objects:
-                source = sized(base, width, height, min(objects, len(fields)))
-                for workers in arguments.workers:
-                    asked = (source, arguments.count, workers, arguments.bop, arguments.image_format)
-                    row = measured(*asked) if workers else in_process(*asked)
-                    rows.append(
-                        {"size": size, "objects": objects, "quality": quality, "workers": workers, **row}
-                    )
-                    print(
-                        f"{size:>10}{objects:8} {quality:8}{workers:8}{row['images_per_second']:10.2f}"
-                        f"{row.get('cpu_seconds', math.nan):8.3f}{row.get('peak_mb', math.nan):9.0f}"
-                        f"{row['files_kb']:7.0f}",
-                        flush=True,
-                    )
+    print(f"{'size':>10}{'objects':>8}{'workers':>8}{'images/s':>10}{'cpu s':>8}{'peak MB':>9}{'kB':>7}")
+    base = source_of(fields)
+    for size in arguments.sizes:
+        width, height = map(int, size.split("x"))
+        for objects in arguments.objects:
+            source = sized(base, width, height, min(objects, len(fields)))
+            for workers in arguments.workers:
+                asked = (source, arguments.count, workers, arguments.bop, arguments.image_format)
+                row = measured(*asked) if workers else in_process(*asked)
+                rows.append({"size": size, "objects": objects, "workers": workers, **row})
+                print(
+                    f"{size:>10}{objects:8}{workers:8}{row['images_per_second']:10.2f}"
+                    f"{row.get('cpu_seconds', math.nan):8.3f}{row.get('peak_mb', math.nan):9.0f}"
+                    f"{row['files_kb']:7.0f}",
+                    flush=True,
+                )
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps({"machine": machine(), "bop": arguments.bop, "rows": rows}, indent=2))
 

@@ -44,7 +44,6 @@ GROUPS = {
     "camera": [f"camera={name}" for name in files("camera")],
     "synthesis": ["synthesis=clutter", "synthesis=photos synthesis.background.root={backgrounds}"],
     "gap": ["gap=disjoint", "gap=uniform", "gap=same"],
-    "quality": ["", "outer.quality=draft"],
 }
 """By group its choices, with what a choice needs; an empty one is the method's own."""
 SMALL = [

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from neural_sim import cameras
 from neural_sim.field.grid import GridField
-from neural_sim.renderer.nerf import QUALITIES, NerfRenderer, Quality
+from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.types import PinholeCamera, Rays
 
 
@@ -120,7 +120,7 @@ def test_tangents_ride_along_with_the_render(field: GridField, rays_per_chunk: i
 def cup() -> GridField:
     """A thin opaque cup with a painted side, as fits leave it: dense within two cells of its surface.
 
-    (A wall thinner than the draft's step of two cells shows through: one cell thick, this cup errs by 0.12.)
+    (A wall thinner than a step of two cells shows through: one cell thick, this cup errs by 0.12.)
     """
     field, cell = GridField(), 1.0 / 24.0
     field.reset(torch.ones(48, 48, 48, dtype=torch.bool), torch.full((3,), -1.0), cell)
@@ -136,28 +136,29 @@ def cup() -> GridField:
 
 
 @pytest.mark.parametrize(
-    ("quality", "opacity_error", "colour_psnr"),
-    [("draft", 0.02, 30.0), ("normal", 0.01, 45.0), ("final", 0.001, 65.0)],
+    ("termination", "step", "opacity_error", "colour_psnr"),
+    [(1e-2, 2.0, 0.02, 30.0), (1e-2, 1.0, 0.01, 45.0), (1e-3, 1.0, 0.001, 65.0)],
 )
-def test_qualities_stay_within_their_errors(
-    cup: GridField, quality: Quality, opacity_error: float, colour_psnr: float
+def test_omissions_stay_within_their_errors(
+    cup: GridField, termination: float, step: float, opacity_error: float, colour_psnr: float
 ) -> None:
     camera, poses = PinholeCamera(64, 64, math.radians(40.0)), view()[1].float()
-    rgb, opacity = NerfRenderer(quality).render(cup, camera, poses)
-    every_rgb, every_opacity = NerfRenderer(quality).render(cup, camera, poses, exact=True)
+    renderer = NerfRenderer(termination=termination, step=step)
+    rgb, opacity = renderer.render(cup, camera, poses)
+    every_rgb, every_opacity = renderer.render(cup, camera, poses, exact=True)
     shown = (opacity > 0.01) | (every_opacity > 0.01)
     assert int(shown.sum()) > 500 and float(every_opacity.max()) > 0.99
     assert 0.0 < float((opacity - every_opacity).abs()[shown].mean()) < opacity_error
     assert float((rgb - every_rgb).square().mean()) < 10.0 ** (-colour_psnr / 10.0)
 
 
-@pytest.mark.parametrize("quality", list(QUALITIES))
-def test_values_and_derivatives_of_a_quality_are_those_of_one_function(
-    field: GridField, quality: Quality, generator: torch.Generator
+@pytest.mark.parametrize(("termination", "step"), [(1e-2, 2.0), (1e-2, 1.0), (1e-3, 1.0)])
+def test_values_and_derivatives_are_those_of_one_function(
+    field: GridField, termination: float, step: float, generator: torch.Generator
 ) -> None:
-    """Views, replayed rays, tangents and reverse mode agree, whatever the quality leaves out."""
+    """Views, replayed rays, tangents and reverse mode agree, whatever is left out."""
     camera, poses = view(7)
-    renderer = NerfRenderer(quality)
+    renderer = NerfRenderer(termination=termination, step=step)
     rates = torch.randn(9, 2, 4, 4, generator=generator, dtype=torch.float64)
     maps, tangents = renderer.render_with_tangents(field, camera, poses, rates)
     torch.testing.assert_close(
@@ -190,12 +191,3 @@ def test_values_and_derivatives_of_a_quality_are_those_of_one_function(
 def test_wrong_shapes_are_refused(field: GridField) -> None:
     with pytest.raises(ValueError, match=r"\(rays, 3\)"):
         NerfRenderer().render_rays(field, Rays(torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)))
-
-
-def test_the_same_renderer_at_another_quality_keeps_the_rest():
-    renderer = NerfRenderer("final", rays_per_chunk=512, cull=False).at("draft")
-    wanted = NerfRenderer("draft")
-    assert (renderer.termination, renderer.step) == (wanted.termination, wanted.step)
-    assert renderer.rays_per_chunk == 512 and not renderer.cull
-    with pytest.raises(ValueError, match="quality"):
-        renderer.at("sketch")

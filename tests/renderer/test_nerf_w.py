@@ -8,7 +8,7 @@ import torch
 from neural_sim import cameras
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.grid import GridField
-from neural_sim.renderer.nerf import NerfRenderer, Quality
+from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.types import PinholeCamera, Rays
 
@@ -157,16 +157,15 @@ def test_wrong_fields_and_weights_are_refused(field: AppearanceField) -> None:
         renderer.render_rays(field, flat(cameras.rays(CAMERA, poses(2))), torch.ones(3, 4))
 
 
-@pytest.mark.parametrize("quality", ["draft", "normal", "final"])
-def test_qualities_are_those_of_the_plain_renderer(field: AppearanceField, quality: Quality) -> None:
+def test_images_are_those_of_the_plain_renderer(field: AppearanceField) -> None:
     """A field whose code does nothing is a plain grid with the same head."""
     plain = GridField(step_cells=0.5, density_gain=1.0).double()
     plain.reset(torch.ones(12, 12, 12, dtype=torch.bool), torch.full((3,), -1.2, dtype=DOUBLE), 0.2)
     with torch.no_grad():
         plain.table.copy_(field.grid.table[:, :4])
         field.out.weight.zero_(), field.out.bias.zero_()
-    expected = NerfRenderer(quality).render(plain.eval(), CAMERA, poses())
-    made = NerfWRenderer(quality).render(field, CAMERA, poses())
+    expected = NerfRenderer().render(plain.eval(), CAMERA, poses())
+    made = NerfWRenderer().render(field, CAMERA, poses())
     torch.testing.assert_close(made, expected, rtol=0, atol=1e-14)
 
 

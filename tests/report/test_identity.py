@@ -54,7 +54,7 @@ def test_all_seeds_of_a_method_are_runs_of_the_same_settings():
 @pytest.mark.parametrize(
     "override",
     [
-        "scale=smoke", "views.count=99", "field=mlp", "renderer.quality=draft", "+synthesis.background.grain=0.5",
+        "scale=smoke", "views.count=99", "field=mlp", "renderer.rays_per_chunk=4096", "+synthesis.background.grain=0.5",
         "unlearned.distance=[2,3]", "target.test_per_object=99", "detector=micro", "training.cold_epochs=29",
         "gap=uniform", "parameter.pose.biased.drill.target=uniform", "parameter=[pose,zoom]", "parameter.pose.bins=4",
     ],

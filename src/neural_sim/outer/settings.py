@@ -19,7 +19,6 @@ from neural_sim.outer.objective import Loss
 from neural_sim.outer.steps import FreeSteps
 from neural_sim.outer.trust_region import TrustRegion
 from neural_sim.ranges import NonNegative, NonNegativeInt, PositiveFraction, PositiveInt, validated
-from neural_sim.renderer.nerf import Quality
 
 
 @validated
@@ -48,8 +47,6 @@ class Outer:
             image is rendered anew, as always if images are differentiated (``gradient=pathwise``) or psi has lights.
         refresh: fraction of the probes that an iteration replaces. The others keep their images, whose other factors
             follow the psi at which they were drawn.
-        quality: quality of the loop's renders; None: the renderer's own, at which the images of scored detectors are
-            always rendered.
         learned: names of the objects whose psi a hypergradient moves; None: all that validation images show. The others
             get no probes and no second derivatives.
         certify_every: number of iterations between comparisons of the hypergradient with the finite-difference response
@@ -78,7 +75,6 @@ class Outer:
     train_first: bool = True
     pool_per_bin: NonNegativeInt = 48
     refresh: PositiveFraction = 0.5
-    quality: Quality | None = None
     learned: Annotated[Sequence[str], MinLen(1)] | None = None
     certify_every: NonNegativeInt = 0
     patience: PositiveInt | None = None

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated
 
 import torch
 from annotated_types import Ge, Lt
@@ -18,70 +17,33 @@ from neural_sim.field.rendering import SAMPLES_AT_ONCE, render_packed, render_vi
 from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import Maps, PinholeCamera, Rays
 
-Quality = Literal["draft", "normal", "final"]
-
-
-@dataclass(frozen=True)
-class Omissions:
-    """The approximations that a quality makes.
-
-    Samples behind a transmittance of ``termination`` are skipped; ``step`` is a factor on the field's step.
-    """
-
-    termination: float
-    step: float
-
-
-QUALITIES: dict[Quality, Omissions] = {
-    "draft": Omissions(1e-2, 2.0),
-    "normal": Omissions(1e-2, 1.0),
-    "final": Omissions(1e-3, 1.0),
-}
-
 
 @validated
 class NerfRenderer:
     """Renders whole views at once, or any bundle of rays with derivatives.
 
-    Samples depend on the field and the rays alone, so a replay is identical, and values and derivatives at one quality
-    belong to the same function.
+    Samples depend on the field and the rays alone, so a replay is identical, and values and derivatives belong to the
+    same function. Against complete renders of six YCB objects (128 pixels), the defaults have a mean error of opacity
+    of 3.0e-4 over the pixels that show the object, and a PSNR of 82 dB.
 
     Args:
-        quality: the approximations; conf/renderer/nerf.yaml has the measured error of each.
         rays_per_chunk: number of rays rendered at once, which bounds the working memory.
-        termination: transmittance behind which samples are skipped (0: none); overrides the quality's.
-        step: factor on the field's step; overrides the quality's.
-        cull: cast rays only for pixels that may see the field's occupied cells; changes no pixel.
-        skip_empty: step over space that the field knows to be empty; changes no pixel.
+        termination: transmittance behind which samples are skipped (0: none).
+        step: factor on the field's step.
     """
 
     def __init__(
         self,
-        quality: Quality = "final",
         rays_per_chunk: PositiveInt = 65536,
-        termination: Annotated[float, Ge(0), Lt(1)] | None = None,
-        step: Positive | None = None,
-        cull: bool = True,
-        skip_empty: bool = True,
+        termination: Annotated[float, Ge(0), Lt(1)] = 1e-3,
+        step: Positive = 1.0,
     ) -> None:
-        self.quality: Quality = quality
-        omitted = QUALITIES[quality]
-        self.termination = omitted.termination if termination is None else termination
-        self.step = omitted.step if step is None else step
         self.rays_per_chunk = rays_per_chunk
-        self.cull, self.skip_empty = cull, skip_empty
+        self.termination, self.step = termination, step
 
     @staticmethod
     def check(kind: type[RadianceField]) -> None:
         """Raise ``ValueError`` for a kind of field that this renderer cannot draw."""
-
-    def at(self, quality: Quality) -> Self:
-        """Return this renderer at another quality, without overrides of the quality's approximations.
-
-        Raises:
-            ValueError: an unknown quality.
-        """
-        return type(self)(quality, self.rays_per_chunk, cull=self.cull, skip_empty=self.skip_empty)
 
     @torch.no_grad()
     def render(
@@ -96,9 +58,8 @@ class NerfRenderer:
             image = render_views(field, camera, camera_to_world, 0.0, self.rays_per_chunk, False, False)
         else:
             image = render_views(
-                field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
-                self.cull, self.skip_empty,
-            )  # fmt: skip
+                field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk
+            )
         return image[..., :3], image[..., 3]
 
     @torch.no_grad()
@@ -115,7 +76,7 @@ class NerfRenderer:
         """
         image = render_views(
             field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
-            self.cull, self.skip_empty, surfaces=True,
+            surfaces=True,
         )  # fmt: skip
         return image[..., :3], image[..., 3], image[..., 4] * _view_cosines(camera, image)
 
@@ -136,7 +97,7 @@ class NerfRenderer:
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)
         value = camera_to_world.new_zeros(shape)
         tangents = camera_to_world.new_zeros(len(rates) + field.light_rates, *shape)
-        for seen in seen_pixels(field, camera, camera_to_world, self.rays_per_chunk, self.cull):
+        for seen in seen_pixels(field, camera, camera_to_world, self.rays_per_chunk):
             rays = pixel_rays(camera, camera_to_world, seen.pixel)
             moving = ray_rates(camera, rays, rates, seen.pixel)
             samples_at_once = min(at_once(SAMPLES_AT_ONCE, value.device), 4 * self.rays_per_chunk)

@@ -129,7 +129,7 @@ class Graph(Images):
     def pool(self) -> PoolStage:
         """Renders of all bins, for the images of the psi loop and for the classifier of the target's boxes."""
         x = self.experiment
-        return PoolStage(self.scene, self._label_shift.per_bin, x.loop.outer.quality, x.run.seed)
+        return PoolStage(self.scene, self._label_shift.per_bin, x.run.seed)
 
     @cached_property
     def shown(self) -> ShownStage:

@@ -9,7 +9,6 @@ from typing_extensions import override
 
 from neural_sim.outer.inner import RenderedPool
 from neural_sim.randomness import stream
-from neural_sim.renderer.nerf import Quality
 from neural_sim.stages.scene import SceneStage
 from neural_sim.stages.stage import Results, Stage
 
@@ -27,7 +26,6 @@ class PoolStage(Stage[RenderedPool]):
 
     scene: SceneStage
     per_bin: int
-    quality: Quality | None
     seed: int
 
     @property
@@ -38,7 +36,5 @@ class PoolStage(Stage[RenderedPool]):
     @override
     def make(self, results: Results) -> RenderedPool:
         scene = results(self.scene)
-        if self.quality is not None:
-            scene = scene.with_quality(self.quality)
         lights = scene.distribution.lights > 0
         return RenderedPool.of(scene, self.per_bin, stream(self.seed, "psi"), lights=lights)

@@ -132,14 +132,12 @@ class PsiStage(Stage[LearnedPsi]):
         return replace(learned, before=warm_start.cost)
 
     def loop(self, results: Results) -> OuterLoop:
-        """Return the loop of the method, not yet run, on renders of ``outer.quality``.
+        """Return the loop of the method, not yet run.
 
         Raises:
             ValueError: the method has no loop.
         """
         method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
-        if self.outer.quality is not None:
-            scene = scene.with_quality(self.outer.quality)
         detector, params = self.warm_start.build(), results(self.warm_start).params
         photographs = self.warm_start.photographs(results)
         pool = results(self.pool) if pooled(self.outer, self.draws, self.distribution) else None

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.parameter.product import HARD, Draws, SceneDistribution
-from neural_sim.renderer.nerf import Quality
 from neural_sim.synthesis.assembly import RenderedImages, RenderedObject, Shared, one_each
 from neural_sim.synthesis.layout import Layout, draw_layout, own_labels
 from neural_sim.synthesis.subjects import FieldSubject, RenderedSubject, Subject
@@ -85,11 +84,6 @@ class Scene:
             others = [subject.name for subject in self.subjects if not isinstance(subject, FieldSubject)]
             raise ValueError(f"scene: want fields, got other subjects for {others}")
         return found
-
-    def with_quality(self, quality: Quality) -> Scene:
-        """Return the scene with all fields rendered at another quality."""
-        fields = (replace(subject, renderer=subject.renderer.at(quality)) for subject in self.fields)
-        return replace(self, subjects=tuple(fields))
 
     # --- one object alone ---
 

@@ -21,7 +21,7 @@ from neural_sim.cameras import reframed
 from neural_sim.digests import digest
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, validated
-from neural_sim.renderer.nerf import NerfRenderer, Quality
+from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.page.samples import write_samples_page
 from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import cost_of, finer_fields
@@ -61,7 +61,6 @@ class ExportTask(Task):
         empty_fraction: fraction of the images that show no object.
         folder: output folder; null: ``dataset`` in the run's folder.
         image_format: ``jpg`` (quality 95, no chroma subsampling) or ``png``.
-        quality: quality of the renders, ``draft``, ``normal`` or ``final``; null: the renderer's.
         detail: ``auto`` fits finer fields to larger views if the images are too large for the run's fields; ``run``
             uses the run's fields.
         largest_views: largest side, in pixels, of the views for ``detail=auto``.
@@ -82,7 +81,6 @@ class ExportTask(Task):
     empty_fraction: Part = 0.0
     folder: str | None = None
     image_format: ImageFormat = "jpg"
-    quality: Quality | None = None
     detail: Literal["auto", "run"] = "auto"
     largest_views: PositiveInt = 384
     scene_size: PositiveInt = 1000
@@ -137,7 +135,7 @@ class ExportTask(Task):
         workers = self._workers(context)
         psi, models = self._psi(context), models_of(graph.objects)
         stages = graph.fields if self.detail == "run" else finer_fields(graph, camera, self.largest_views)
-        renderer = x.imaging.renderer if self.quality is None else x.imaging.renderer.at(self.quality)
+        renderer = x.imaging.renderer
         scene = graph.scene.showing(graph.subjects(stages, renderer))
         millimetres = tuple(model.millimetres for model in models)
         identity = {

@@ -34,4 +34,4 @@ def small_world():
     rgb, opacity = NerfRenderer().render(field, camera, pose, exact=True)
     straight = rgb / opacity.clamp_min(1e-6)[..., None]
     views = PosedViews(torch.cat([straight, opacity[..., None]], -1), pose, camera)
-    return SimpleNamespace(names=("block",), fields=[field], views=views, held_out=2, renderer=NerfRenderer())
+    return SimpleNamespace(names=("block",), views=views, held_out=2)

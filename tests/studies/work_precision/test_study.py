@@ -36,8 +36,8 @@ def test_the_experiment_has_every_family_and_the_stages_that_they_need():
         return {stage.key for stage in stages}
 
     assert not read("quadrature", "solver")
-    assert read("renderer") == keys(graph.fields) and read("field") == keys(graph.views)
-    each = [*graph.fields, *graph.views, graph.warm_start, graph.targets]
+    assert read("field") == keys(graph.views)
+    each = [*graph.views, graph.warm_start, graph.targets]
     assert read(*FAMILIES) == keys(each)
 
 

@@ -17,11 +17,9 @@ from typing import Literal, Protocol, TypeVar
 import torch
 
 from neural_sim.devices import peak_bytes, synchronise
-from neural_sim.field.base import RadianceField
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
 from neural_sim.ranges import PositiveInt, validated
-from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.graph import Psi
 from neural_sim.studies.frozen_loop import FrozenLoop
@@ -207,11 +205,6 @@ class World:
         return self.context.graph.names
 
     @property
-    def fields(self) -> Sequence[RadianceField]:
-        """A fitted field of every object."""
-        return [self.context.results(stage).field for stage in self.context.graph.fields]
-
-    @property
     def views(self) -> PosedViews:
         """Views of the first object, the held-out ones last."""
         return self.context.results(self.context.graph.views[0])
@@ -220,11 +213,6 @@ class World:
     def held_out(self) -> int:
         """The number of held-out views."""
         return self.context.experiment.imaging.views.held_out
-
-    @property
-    def renderer(self) -> NerfRenderer:
-        """The renderer of the run."""
-        return self.context.experiment.imaging.renderer
 
     @property
     def loop(self) -> FrozenLoop:

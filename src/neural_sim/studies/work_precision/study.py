@@ -21,19 +21,17 @@ from neural_sim.studies.work_precision.field import Fields
 from neural_sim.studies.work_precision.hypergradient import Hypergradients
 from neural_sim.studies.work_precision.measurement import Clock, Family, Series, Timing, World
 from neural_sim.studies.work_precision.quadrature import Quadrature
-from neural_sim.studies.work_precision.renderer import Renderer
 from neural_sim.studies.work_precision.report import document, publish, write_docs
 from neural_sim.studies.work_precision.solver import Solver
 from neural_sim.tasks.context import Context, Task
 
 _log = logging.getLogger(__name__)
-Name = Literal["quadrature", "renderer", "field", "solver", "hypergradient", "estimator"]
+Name = Literal["quadrature", "field", "solver", "hypergradient", "estimator"]
 FAMILIES: tuple[Name, ...] = get_args(Name)
 """Families in the order of the psi loop; each is a key of the settings."""
 COMMAND = "python -m src.main +experiment=work_precision"
 """Command shown in the sections of a documentation page; it runs at the scale ``quick``, at which they are made."""
 READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
-    "renderer": lambda graph: graph.fields,
     "field": lambda graph: graph.views,
     "hypergradient": lambda graph: [graph.warm_start, graph.targets],
     "estimator": lambda graph: [graph.warm_start, graph.targets],
@@ -52,7 +50,6 @@ class WorkPrecision(Task):
         clock: ``cpu_seconds`` of CPU time, or ``seconds`` of wall-clock time.
         docs: a Markdown page whose sections on the measured families are rewritten; null: none.
         quadrature: settings of a family.
-        renderer: likewise.
         fits: settings of the family ``field``.
         solver: likewise.
         hypergradient: likewise.
@@ -64,7 +61,6 @@ class WorkPrecision(Task):
     clock: Clock = "cpu_seconds"
     docs: str | None = None
     quadrature: Quadrature = field(default_factory=Quadrature)
-    renderer: Renderer = field(default_factory=Renderer)
     fits: Fields = field(default_factory=Fields)
     solver: Solver = field(default_factory=Solver)
     hypergradient: Hypergradients = field(default_factory=Hypergradients)
