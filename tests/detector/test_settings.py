@@ -68,8 +68,6 @@ CASES = [
     (Training, {"batch_size": 1, "real": Real("combined")}, "Training.batch_size: want at least 2"),
     (Optimisation, {"epochs": 0}, "Optimisation.epochs: want at least 1"),
     (partial(Optimisation, 1), {"batch_size": 0}, "Optimisation.batch_size: want at least 1"),
-    (Recording, {"part": 0.0}, "Recording.part: want more than 0 and at most 1"),
-    (Recording, {"part": 1.1}, "Recording.part: want more than 0 and at most 1"),
     (Recording, {"max_memory_mb": 0.0}, "Recording.max_memory_mb: want more than 0"),
     (SmoothAP, {"temperature": 0.0}, "SmoothAP.temperature: want more than 0"),
     (SmoothAP, {"width": -1.0}, "SmoothAP.width: want more than 0"),

@@ -212,19 +212,12 @@ def test_states_alone_are_kept_where_gradients_do_not_fit(cached):
         _recorded(cached, Recording(max_memory_mb=0.9 * least))
 
 
-@pytest.mark.parametrize(("part", "first"), [(1.0, 0), (0.5, 4), (0.01, 8)])
-def test_a_part_is_that_of_the_last_steps(cached, part, first):
-    trajectory = _recorded(cached, Recording(part))[1].trajectory
-    assert trajectory.first == first and set(trajectory.gradients) == set(range(first, 9))
-    assert [step for segment in trajectory.segments()[::-1] for step in segment] == list(range(first, 9))
-
-
 def test_training_without_a_trainer_steps_down_a_quadratic():
     """One step by hand: against the gradient of theta^2 / 2 by the rate, and theta shrinks by the decay."""
     start, rows = torch.tensor([2.0], dtype=DOUBLE), (torch.tensor([0]),)
     made = train(AdamW(0.1), start, rows, (0.1,), lambda theta, _: theta)
     assert float(made.end) == pytest.approx(2.0 * 0.99 - 0.1, rel=1e-7)
-    assert len(made) == 1 and made.first == 0
+    assert len(made) == 1 and set(made.checkpoints) == {0}
 
 
 def test_few_states_are_kept():

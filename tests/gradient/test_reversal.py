@@ -201,23 +201,6 @@ def test_states_kept_and_states_computed_again_give_the_same(pulled):
     torch.testing.assert_close(again.images, kept.images, rtol=1e-12, atol=0.0)
 
 
-def test_a_part_of_the_steps_is_the_derivative_by_what_comes_late(micro, generator):
-    """As if images had their weights from the third step on; before it, none."""
-    direction = torch.randn(8, generator=generator, dtype=DOUBLE)
-    found = float(micro.accumulated(recording=Recording(part=0.6)).images @ direction)
-    begun = micro.trained(micro.examples)
-    third, _ = begun.replayed(range(3), lambda *_: None)[2]
-
-    def outcome(step):
-        examples, held = micro.weighted(1.0 + step * direction), third
-        for done in range(2, 6):
-            gradient = examples.gradient(held[0], micro.like, micro.rows[done])
-            held = RULE.step(held, gradient, begun.rates[done], done)
-        return micro.outer(held[0])
-
-    assert found == pytest.approx(extrapolated(outcome, STEP), rel=1e-6)
-
-
 def _small(generator, steps=5):
     """Weighted smooth regression of six rows by eight parameters, every step written out with its graph."""
     design, targets = (

@@ -288,7 +288,7 @@ def test_pathwise_wants_the_derivative_by_inputs(problem):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"product": "dense"}, {"part": 0.0}, {"max_memory_mb": -1.0}, {"probes_per_step": -1}, {"scored_steps": -1},
+    [{"product": "dense"}, {"max_memory_mb": -1.0}, {"probes_per_step": -1}, {"scored_steps": -1},
      {"chunk_size": 0}, {"floor": -0.1}, {"floor": float("nan")}],
 )  # fmt: skip
 def test_nonsense_is_refused(settings):

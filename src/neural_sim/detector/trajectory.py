@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.ranges import Positive, PositiveFraction, validated
+from neural_sim.ranges import Positive, validated
 
 logger = logging.getLogger(__name__)
 State = tuple[Tensor, ...]
@@ -101,38 +101,31 @@ def _root(values: Tensor) -> Tensor:
 @validated
 @dataclass(frozen=True)
 class Recording:
-    """How much of a training is recorded.
+    """How a training is recorded.
 
     Args:
-        part: fraction of the steps, counted from the end, that can be reversed.
         max_memory_mb: limit in MB. The record has the states of every sqrt(steps)-th step and all gradients; the states
             in between are recomputed elementwise. If the gradients do not fit, they are recomputed, at the cost of one
             more training.
     """
 
-    part: PositiveFraction = 1.0
     max_memory_mb: Positive = 2048.0
 
-    def first(self, steps: int) -> int:
-        """Return the first of the recorded steps."""
-        return steps - max(1, math.ceil(self.part * steps))
-
     def keeps_gradients(self, steps: int, state_bytes: int, vector_bytes: int) -> bool:
-        """Tell whether the gradients of all recorded steps fit into the limit together with the states.
+        """Tell whether the gradients of all steps fit into the limit together with the states.
 
         Raises:
             ValueError: not even the states fit.
         """
-        count = steps - self.first(steps)
-        length = segment_length(count)
+        length = segment_length(steps)
         # States at the first step of each segment, plus one segment's states and gradients while it is reversed.
-        least = (math.ceil(count / length) + length) * state_bytes + length * vector_bytes
+        least = (math.ceil(steps / length) + length) * state_bytes + length * vector_bytes
         if least > self.max_memory_mb * MEGABYTE:
             raise ValueError(
-                f"outer.adjoint.max_memory_mb: {count} steps take {least / MEGABYTE:.0f} MB at least, got "
-                f"{self.max_memory_mb:g}; raise it, or lower outer.adjoint.part"
+                f"outer.adjoint.max_memory_mb: {steps} steps take {least / MEGABYTE:.0f} MB at least, got "
+                f"{self.max_memory_mb:g}"
             )
-        return least + count * vector_bytes <= self.max_memory_mb * MEGABYTE
+        return least + steps * vector_bytes <= self.max_memory_mb * MEGABYTE
 
 
 @dataclass(frozen=True)
@@ -141,7 +134,7 @@ class Trajectory:
 
     ``rows`` are each step's batch, as rows of the training set; the step's gradient is that of the batch's mean loss
     (plus the proximal term). ``rates`` are the learning rates. ``checkpoints`` are the states before some steps;
-    ``gradients`` are those of all steps from the first checkpoint on, or empty. ``end`` is theta after the last step.
+    ``gradients`` are those of all steps, or empty. ``end`` is theta after the last step.
     """
 
     rule: AdamW
@@ -164,11 +157,6 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    @property
-    def first(self) -> int:
-        """The first step that can be reversed."""
-        return min(self.checkpoints)
 
     def segments(self) -> list[range]:
         """Return the ranges of steps between checkpoints, the last range first."""
@@ -198,7 +186,7 @@ class Recorder:
     """Records the steps of one training.
 
     Args:
-        recording: how much is recorded.
+        recording: how it is recorded.
         rule: the optimiser.
         steps: number of steps of the training.
         theta: the parameters, for their size and type.
@@ -209,8 +197,7 @@ class Recorder:
 
     def __init__(self, recording: Recording, rule: AdamW, steps: int, theta: Float[Tensor, "n"]) -> None:
         self.rule = rule
-        self._first = recording.first(steps)
-        self._length = segment_length(steps - self._first)
+        self._length = segment_length(steps)
         self._rates: list[float] = []
         self._checkpoints: dict[int, State] = {}
         self._gradients: dict[int, Tensor] = {}
@@ -223,9 +210,7 @@ class Recorder:
         """Record a step before it is taken. ``state`` and ``gradient`` return copies and are called only if needed."""
         number = len(self._rates)
         self._rates.append(rate)
-        if number < self._first:
-            return
-        if (number - self._first) % self._length == 0:
+        if number % self._length == 0:
             self._checkpoints[number] = state()
         if self._keeps_gradients:
             self._gradients[number] = gradient()

@@ -118,8 +118,8 @@ class RecordedTraining:
 
     @property
     def steps(self) -> int:
-        """The number of recorded steps."""
-        return len(self.trajectory) - self.trajectory.first
+        """The number of steps."""
+        return len(self.trajectory)
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def reversed_steps(
     wanted: Wanted = "weights",
     floor: float = 0.0,
 ) -> Iterator[ReversedStep]:
-    """Walk back through the steps of a training, from the last to the first recorded one.
+    """Walk back through the steps of a training, from the last to the first.
 
     Args:
         training: the training.

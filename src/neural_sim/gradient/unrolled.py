@@ -32,7 +32,6 @@ from neural_sim.ranges import (
     NonNegative,
     NonNegativeInt,
     Positive,
-    PositiveFraction,
     PositiveInt,
     validated,
 )
@@ -130,7 +129,6 @@ class Unrolled:
 
     Args:
         product: how a batch's Hessian is multiplied, see ``gradient.reversal.reversed_steps``.
-        part: fraction of the steps that are reversed, counted from the end; 1 is exact.
         max_memory_mb: memory limit of the recorded training, see ``detector.trajectory.Recording``.
         probes_per_step: number of probes of every bin that a step scores, in shuffled passes over all of them; 0: all.
             At 1, most of a derivative's variance comes from the choice of probes and of validation images
@@ -145,7 +143,6 @@ class Unrolled:
     """
 
     product: Product = "forward_difference"
-    part: PositiveFraction = 1.0
     max_memory_mb: Positive = 2048.0
     probes_per_step: NonNegativeInt = 1
     scored_steps: NonNegativeInt = 60
@@ -154,8 +151,8 @@ class Unrolled:
 
     @property
     def recording(self) -> Recording:
-        """The parts of a training that this adjoint needs recorded."""
-        return Recording(self.part, self.max_memory_mb)
+        """How the training is recorded."""
+        return Recording(self.max_memory_mb)
 
     def doubts(self, adjoint: UnrolledAdjoint) -> list[str]:
         """Name the conditions that a reversed training fails: ``solver`` if it is not ``finite``."""

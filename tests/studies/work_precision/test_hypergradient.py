@@ -57,7 +57,7 @@ def test_every_way_has_an_error_and_the_default_is_the_loops_own():
     assert unrolled.name == "hypergradient/unrolled" and all(name.startswith("unrolled") for name in error)
     assert error[EXACT] == 0.0
     # Of two steps of a new network, whose differences of gradients in float32 have few digits.
-    assert error["unrolled, all probes every step"] < 0.5 < error["unrolled, last quarter"]
+    assert error["unrolled, all probes every step"] < 0.5
     own = ways(OUTER, SOLVER)[DEFAULT].outer
     assert own.adjoint == OUTER.adjoint == Unrolled()
 

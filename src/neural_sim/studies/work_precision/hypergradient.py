@@ -64,8 +64,6 @@ def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
         "unrolled, all probes every step": unrolled("probes", **everything),
         EXACT: unrolled("exact", product="reverse_over_reverse", **everything),
         "unrolled, exact: no floor": unrolled("floor", floor=0.0),
-        "unrolled, last half of the steps": unrolled("part", part=0.5),
-        "unrolled, last quarter": unrolled("part", part=0.25),
         "implicit, as configured": Way("implicit", implicit, solver),
         "implicit, all images, rtol 1e-3": Way(
             "implicit", replace(outer, adjoint=Implicit(curvature_images=0)), replace(solver, rtol=1e-3)
