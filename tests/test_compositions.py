@@ -128,7 +128,6 @@ def test_neural_sim_reads_the_target_before_it_follows_derivatives():
     plain, derivative = (experiment(f"baseline={name}") for name in ("neural_sim", "neural_sim_derivative"))
     reads = {
         "first_step": LabelShift(per_bin=48),
-        "refine": "unread",
         "patience": 2,
         "trust": Trust(level=0.01),
     }

@@ -257,10 +257,12 @@ def test_a_first_step_shares_no_random_numbers_with_the_trainings_that_judge_it(
 
 
 def test_a_first_step_that_finds_nothing_costs_no_training(scene):
-    plain, module = (checked_loop(scene, 2, **more) for more in ({}, {"first": Fake(torch.zeros(2, 4))}))
+    unsure = (replace(SHOWN[0], finding="uncertain"),)
+    first = Fake(torch.zeros(2, 4), shown=unsure)
+    plain, module = (checked_loop(scene, 2, **more) for more in ({}, {"first": first}))
     one, other = (learn_psi(loop) for loop in (plain, module))
     assert [r.detector_steps for r in one.records] == [r.detector_steps for r in other.records]
-    assert other.records[0].verdicts == {} and other.shown == SHOWN
+    assert other.records[0].verdicts == {} and other.shown == unsure
     assert torch.equal(one.last, other.last)
 
 
@@ -269,7 +271,7 @@ def test_an_object_that_was_read_takes_no_step_along_a_derivative_unless_a_train
     scene, monkeypatch, right
 ):
     psi = torch.stack([THERE[0], torch.zeros(4)])
-    module = checked_loop(scene, first=Fake(psi), refine="unread")
+    module = checked_loop(scene, first=Fake(psi))
     scored_by(monkeypatch, lambda psi: torch.stack([psi[0, 0] if right else -psi[0, 0], psi[1, 0] * 0.0]))
     learned = learn_psi(module)
     assert learned.records[0].verdicts["a"].accepted == right and len(learned.records) == 3
@@ -283,7 +285,7 @@ def test_an_object_that_was_read_takes_no_step_along_a_derivative_unless_a_train
 @pytest.mark.parametrize("psi", [torch.zeros(2, 4), THERE], ids=["stay", "move"])
 def test_a_loop_whose_objects_were_all_read_ends_without_a_derivative(scene, monkeypatch, psi):
     both = (*SHOWN, replace(SHOWN[0], name="b"))
-    module = checked_loop(scene, 4, first=Fake(psi, shown=both), refine="unread")
+    module = checked_loop(scene, 4, first=Fake(psi, shown=both))
     scored_by(monkeypatch, lambda psi: torch.stack([psi[0, 0], psi[1, 1]]))
     learned = learn_psi(module)
     (record,) = learned.records
@@ -308,7 +310,7 @@ def test_a_reading_that_a_training_accepts_is_not_taken_back_for_less_than_train
         )
 
     monkeypatch.setattr(Trained, "scores", property(lambda trained: scores(trained).double()))
-    given = {"first": Fake(psi, shown=both), "refine": "unread", "steps": TrustRegion()}
+    given = {"first": Fake(psi, shown=both), "steps": TrustRegion()}
     learned = learn_psi(checked_loop(scene, 4, **given))
     assert learned.records[-1].verdicts["a"].accepted and not learned.records[-1].taken_back
     assert torch.equal(learned.last, psi.double())

@@ -45,8 +45,8 @@ class GradientLoop(OuterLoop, ABC):
 
     With a trust region, an iteration begins by accepting or rejecting the last step, if any: it trains at the new psi
     with the random numbers of the training before that step. The last iteration does nothing else. Before the first
-    derivative, the loop tries the psi that ``first`` proposes, if any. With ``outer.refine=unread``, objects with an
-    estimate then stay where they are, unless it was rejected. The loop ends early if no object is left to move, after
+    derivative, the loop tries the psi that ``first`` proposes, if any. Objects with an estimate then stay where they
+    are, unless it was rejected. The loop ends early if no object is left to move, after
     ``outer.patience`` iterations without a step to try, or if ``outer.trust`` stops it. At the end, with
     ``steps.take_back``, every object that was free to move returns to the best psi that it has had.
     """
@@ -87,7 +87,7 @@ class GradientLoop(OuterLoop, ABC):
         if last or self.steps.pending:
             trained, verdicts = self._judge()
             self.psi.data[self._labels] = self.steps.reported
-        if not self.records and self.settings.refine == "unread":
+        if not self.records:
             self._settle(verdicts)
         if self._stopped:
             trained = trained or self._trained_once()

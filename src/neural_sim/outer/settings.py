@@ -51,9 +51,8 @@ class Outer:
             get no probes and no second derivatives.
         certify_every: number of iterations between comparisons of the hypergradient with the finite-difference response
             of training at the same psi (``outer.response``, one training for each bin); 0: never.
-        refine: which objects take steps along derivatives after the first step: ``all``, or only those (``unread``)
-            that it could not estimate, or whose estimate a training rejected.
-        first_step: where the loop goes first: along the first derivative, or to an estimate from the target's boxes.
+        first_step: where the loop goes first: along the first derivative, or to an estimate from the target's boxes;
+            then only the objects that it could not estimate, or whose estimate a training rejected, follow derivatives.
         steps: how psi follows its derivative: freely, or in a trust region. A trust region uses common random numbers,
             and its last iteration only trains, to accept or reject the last step.
         adjoint: the hypergradient of the training that was run, or that at a stationary point (the paper's Eq. 2).
@@ -78,7 +77,6 @@ class Outer:
     learned: Annotated[Sequence[str], MinLen(1)] | None = None
     certify_every: NonNegativeInt = 0
     patience: PositiveInt | None = None
-    refine: Literal["unread", "all"] = "all"
     first_step: Derivative | LabelShift = field(default_factory=Derivative)
     steps: TrustRegion | FreeSteps = field(default_factory=TrustRegion)
     adjoint: Unrolled | Implicit = field(default_factory=Unrolled)
