@@ -49,7 +49,7 @@ def actions(certificate):
 def test_a_good_step_is_kept_with_everything_recorded():
     certificate = judge(result(), cosine=0.8)
     assert certificate.doubts == [] and actions(certificate) == ["kept", "kept"]
-    assert not certificate.stopped and not certificate.void
+    assert not certificate.void
     adjoint = certificate.adjoint
     assert (adjoint.solver_status, adjoint.solver_steps, adjoint.damping_raises) == ("CONVERGED", 7, 1)
     assert (adjoint.curvature_min, adjoint.curvature_max, adjoint.damping) == (-1.0, 9.0, 3.0)
@@ -70,16 +70,14 @@ def test_a_good_step_is_kept_with_everything_recorded():
 )
 @pytest.mark.parametrize(
     ("on_untrusted", "action"),
-    [("shrink", "shrunk"), ("keep", "kept"), ("skip", "skipped"), ("stop", "stopped")],
+    [("shrink", "shrunk"), ("keep", "kept"), ("skip", "skipped")],
 )
 def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
     found, cosine, doubt, on_untrusted, action
 ):
     certificate = judge(found, cosine, on_untrusted=on_untrusted)
     assert certificate.doubts == [doubt] and actions(certificate) == [action] * 2
-    assert certificate.stopped == (action == "stopped") and certificate.void == (
-        action not in ("shrunk", "kept")
-    )
+    assert certificate.void == (action not in ("shrunk", "kept"))
     free = judge(found, cosine, level=None, min_cosine=None, adjoint=FREE)
     assert free.doubts == (["solver"] if doubt == "solver" else [])
 
@@ -89,17 +87,15 @@ def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
     [
         ((0.1, 0.101), "shrink", ["kept", "shrunk"]),
         ((0.9, 0.001), "skip", ["skipped", "kept"]),
-        ((0.9, 0.001), "stop", ["skipped", "kept"]),
         ((0.9, 0.2), "shrink", ["shrunk", "shrunk"]),
         ((0.9, 0.2), "skip", ["skipped", "skipped"]),
-        ((0.9, 0.2), "stop", ["stopped", "stopped"]),
     ],
 )
 def test_an_object_without_signal_holds_up_no_other(p_values, on_untrusted, expected):
-    """``stop`` ends the loop only where no object is left. What was skipped for want of signal joins the momentum."""
+    """What was skipped for want of signal joins the momentum."""
     certificate = judge(result(p_values=p_values), on_untrusted=on_untrusted)
     assert certificate.doubts == [] and actions(certificate) == expected
-    assert certificate.stopped == certificate.void == ("stopped" in expected)
+    assert not certificate.void
     assert actions(judge(result(p_values=p_values), level=None)) == ["kept", "kept"]
 
 
@@ -179,10 +175,9 @@ def test_each_adjoint_has_a_record_of_its_own_and_what_was_compared_has_none():
 
 
 def test_a_gradient_that_is_not_finite_is_never_followed():
-    wanted = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}
-    for on_untrusted, action in wanted.items():
+    for on_untrusted in ("shrink", "keep", "skip"):
         certificate = judge(result(gradient=(math.nan, 0.0)), on_untrusted=on_untrusted)
-        assert actions(certificate) == [action] * 2 and "not finite" in certificate.doubts
+        assert actions(certificate) == ["skipped"] * 2 and "not finite" in certificate.doubts
         assert certificate.void
 
 

@@ -22,8 +22,8 @@ PROXIMAL = 20.0  # past the negative curvature of an untrained detector
 NOTHING_WILL_DO = Implicit(curvature_images=6, max_stationarity=0.0)
 
 
-@pytest.mark.parametrize("action", ["skip", "stop", "shrink", "keep"])
-def test_untrusted_steps_are_skipped_stop_the_loop_are_shrunk_or_kept(scene, action):
+@pytest.mark.parametrize("action", ["skip", "shrink", "keep"])
+def test_untrusted_steps_are_skipped_shrunk_or_kept(scene, action):
     estimator = StratifiedEstimator(probes_per_bin=2)
     learned = learn_psi(
         small_loop(
@@ -31,8 +31,8 @@ def test_untrusted_steps_are_skipped_stop_the_loop_are_shrunk_or_kept(scene, act
         )
     )
     assert all(record.certificate.doubts == ["stationarity"] for record in learned.records)
-    assert len(learned.records) == (1 if action == "stop" else 2)
-    if action not in ("shrink", "keep"):
+    assert len(learned.records) == 2
+    if action == "skip":
         assert not learned.last.any()
         return
     settings = {"adjoint": NOTHING_WILL_DO, "trust": Trust(on_untrusted=action)}
@@ -56,7 +56,7 @@ class Told:
         )
 
 
-@pytest.mark.parametrize(("on_untrusted", "part"), [("shrink", 0.25), ("skip", 0.0), ("stop", 0.0)])
+@pytest.mark.parametrize(("on_untrusted", "part"), [("shrink", 0.25), ("skip", 0.0)])
 def test_a_step_without_signal_is_cut_for_its_object_and_factor_alone(scene, on_untrusted, part):
     scene = dataclasses.replace(scene, distribution=SceneDistribution.of([Pose(bins=3), Zoom(bins=2)]))
     psi = torch.zeros(2, 5)

@@ -20,11 +20,9 @@ from neural_sim.gradient.significance import SMALLEST
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.ranges import validated
 
-OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
-Action = Literal["kept", "shrunk", "waited", "skipped", "stopped"]
-_ACTIONS: Mapping[OnUntrusted, Action] = {
-    "shrink": "shrunk", "keep": "kept", "skip": "skipped", "stop": "stopped"
-}  # fmt: skip
+OnUntrusted = Literal["shrink", "keep", "skip"]
+Action = Literal["kept", "shrunk", "waited", "skipped"]
+_ACTIONS: Mapping[OnUntrusted, Action] = {"shrink": "shrunk", "keep": "kept", "skip": "skipped"}
 
 
 Actions = dict[str, dict[str, Action]]
@@ -45,7 +43,6 @@ class Trust:
             ``outer.certify_every``); None: no limit.
         on_untrusted: what happens to steps that fail: those of one object and factor if the derivative is not
             significant, all steps if the whole hypergradient fails. ``keep`` takes them in full, as the paper does.
-            ``stop`` skips insignificant steps, and ends the loop if the whole hypergradient fails or no step is left.
         shrink: fraction of an untrusted step that is taken under ``on_untrusted=shrink``.
     """
 
@@ -144,14 +141,10 @@ class Certificate:
     actions: Actions
 
     @property
-    def stopped(self) -> bool:
-        """Return whether the loop ends after this iteration."""
-        return "stopped" in self._taken
-
-    @property
     def void(self) -> bool:
         """Return whether this iteration's derivative is discarded; it then does not enter the momentum either."""
-        return self.stopped or (bool(self.doubts) and not self._taken & {"shrunk", "kept"})
+        taken = {action for by_factor in self.actions.values() for action in by_factor.values()}
+        return bool(self.doubts) and not taken & {"shrunk", "kept"}
 
     def waiting(self, steps: Collection[tuple[str, str]]) -> Certificate:
         """Mark those of ``steps`` (pairs of object and factor) that are kept as waiting."""
@@ -167,10 +160,6 @@ class Certificate:
     def without(self, names: Collection[str]) -> Certificate:
         """Leave out what happens to the named objects, whose psi is settled."""
         return replace(self, actions={name: a for name, a in self.actions.items() if name not in names})
-
-    @property
-    def _taken(self) -> set[Action]:
-        return {action for by_factor in self.actions.values() for action in by_factor.values()}
 
 
 def certify(
@@ -237,21 +226,13 @@ def _quality(result: Hypergradient) -> Quality | None:
 def _by_signal(
     p_values: Mapping[str, Mapping[str, float]], names: Sequence[str], factors: Sequence[str], trust: Trust
 ) -> Actions:
-    """Keep the steps whose derivative is significant.
-
-    An object at its optimum has no significant derivative, which is no reason to stop the others: ``stop`` skips its
-    step, and ends the loop only if no step is left.
-    """
-    stops = trust.on_untrusted == "stop"
-    otherwise: Action = "skipped" if stops else _ACTIONS[trust.on_untrusted]
+    """Keep the steps whose derivative is significant."""
+    otherwise = _ACTIONS[trust.on_untrusted]
     limit = math.inf if trust.level is None else trust.level
-    actions: Actions = {
+    return {
         name: {f: "kept" if p_values.get(name, {}).get(f, 0.0) <= limit else otherwise for f in factors}
         for name in names
     }
-    if stops and not any("kept" in by_factor.values() for by_factor in actions.values()):
-        return {name: dict.fromkeys(factors, "stopped") for name in names}
-    return actions
 
 
 def line(certificate: Certificate, iteration: int, iterations: int, validation_loss: float) -> str:

@@ -46,8 +46,8 @@ class GradientLoop(OuterLoop, ABC):
     With a trust region, an iteration begins by accepting or rejecting the last step, if any: it trains at the new psi
     with the random numbers of the training before that step. The last iteration does nothing else. Before the first
     derivative, the loop tries the psi that ``first`` proposes, if any. Objects with an estimate then stay where they
-    are, unless it was rejected. The loop ends early if no object is left to move, after
-    ``outer.patience`` iterations without a step to try, or if ``outer.trust`` stops it. At the end, with
+    are, unless it was rejected. The loop ends early if no object is left to move, or after
+    ``outer.patience`` iterations without a step to try. At the end, with
     ``steps.take_back``, every object that was free to move returns to the best psi that it has had.
     """
 
@@ -96,7 +96,7 @@ class GradientLoop(OuterLoop, ABC):
             trained, result = derived.trained, derived.result
             certificate = self._step(derived)
             self._idle = self._idle + 1 if self._judges and not self.steps.pending else 0
-            self._stopped = certificate.stopped or self._idle == self.settings.patience
+            self._stopped = self._idle == self.settings.patience
         best = self._way.best() if self._takes_back and (last or self._stopped) else {}
         scores = trained.scores if result is None else self._before
         outcome = Outcome(verdicts, {name: back for name, (_, back) in best.items()})

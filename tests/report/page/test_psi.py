@@ -32,9 +32,9 @@ def test_a_step_is_judged_by_the_next_record():
 
 
 def test_free_steps_are_taken_without_a_verdict_and_doubts_are_named():
-    records = [record({"a": "kept"}), record({"a": "waited"}), record({"a": "stopped"}, doubts=["solver"])]
+    records = [record({"a": "kept"}), record({"a": "waited"}), record({"a": "skipped"}, doubts=["solver"])]
     (row,) = step_rows(records, ["a"])
-    assert [cell.kind for cell in row.cells] == ["taken", "waited", "stopped"]
+    assert [cell.kind for cell in row.cells] == ["taken", "waited", "skipped"]
     assert "doubts: solver" in row.cells[2].note
 
 

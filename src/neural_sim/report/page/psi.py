@@ -148,15 +148,13 @@ def shown_chart(one: FactorEstimate) -> str:
 
 # --- steps ---
 
-Kind = Literal["accepted", "rejected", "taken", "shrunk", "waited", "skipped", "stopped", "none"]
+Kind = Literal["accepted", "rejected", "taken", "shrunk", "waited", "skipped", "none"]
 SYMBOLS: Mapping[Kind, str] = {
-    "accepted": "✓", "rejected": "✗", "taken": "→", "shrunk": "⇢", "waited": "…", "skipped": "·", "stopped": "■",
-    "none": "",
+    "accepted": "✓", "rejected": "✗", "taken": "→", "shrunk": "⇢", "waited": "…", "skipped": "·", "none": "",
 }  # fmt: skip
 _UNJUDGED: Mapping[str, Kind] = {
     "kept": "taken",
     "shrunk": "shrunk",
-    "stopped": "stopped",
     "waited": "waited",
     "skipped": "skipped",
 }
