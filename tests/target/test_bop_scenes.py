@@ -143,6 +143,24 @@ def test_targets_and_folders_say_which_images(root, made, meshes):
     (root / "test_targets_bop19.json").write_text('[{"im_id": 3}]')
     with pytest.raises(ValueError, match=r"test_targets_bop19\.json: \[0\]: lacks \['scene_id'\]"):
         of(root)
+    for entry in (
+        {"scene_id": None, "im_id": 3},
+        {"scene_id": 1, "im_id": 1.5},
+        {"scene_id": 1, "im_id": -1},
+    ):
+        (root / "test_targets_bop19.json").write_text(json.dumps([entry]))
+        with pytest.raises(
+            ValueError, match=r"bop19\.json: \[0\]: (scene|im)_id: want a whole number of at least 0"
+        ):
+            of(root)
+
+
+def test_the_files_of_an_image_are_its_own(root, made):
+    """Its masks are named rather than searched for among all of its scene."""
+    target, folder = of(root), root / "test" / "000001"
+    (folder / "mask_visib" / "000001_000099.png").write_bytes(b"")
+    masks = [path for path in target.reader.files(name_of(made[0])) if path.parent.name == "mask_visib"]
+    assert masks == [folder / "mask_visib" / f"000001_{i:06d}.png" for i in range(3)]
 
 
 def test_a_grey_or_jpeg_image_is_found(root, made):
@@ -168,6 +186,7 @@ def edited(root, file, change):
         ("scene_gt", lambda d: d["1"][1].pop("cam_R_m2c"), r"scene_gt\.json: 1\[1\]: lacks \['cam_R_m2c'\]"),
         ("scene_gt", lambda d: d["1"][1].update(cam_R_m2c=[2.0] * 9), r"scene_gt\.json: 1\[1\]: .* is no rotation"),
         ("scene_gt", lambda d: d["1"][1].update(cam_t_m2c=[2.0]), r"scene_gt\.json: 1\[1\]: cam_t_m2c: want 3 finite"),
+        ("scene_gt", lambda d: d["1"][1].update(obj_id=1.5), r"scene_gt\.json: 1\[1\]: obj_id: want a whole number"),
         ("scene_gt", lambda d: d["1"].pop(), r"scene_gt\.json: 1: want a list of objects, and as many"),
         ("scene_gt_info", lambda d: d["1"][0].pop("visib_fract"),
          r"scene_gt_info\.json: 1\[0\]: lacks \['visib_fract'\]"),
@@ -177,13 +196,29 @@ def edited(root, file, change):
         ("scene_camera", lambda d: d["1"].update(cam_K=[1.0] * 9),
          r"scene_camera\.json: 1: cam_K: want \[\[fx, 0, cx\]"),
         ("scene_camera", lambda d: d["1"].update(width=640, height=480),
-         r"scene_camera\.json: 1: is of images of 640 x 480, .*000001\.png is 120 x 90"),
+         r"scene_camera\.json: 1: is for images of 640 x 480 pixels, .*000001\.png has 120 x 90"),
     ],
 )  # fmt: skip
 def test_bad_entries_are_refused_with_file_and_key(root, made, file, change, message):
     edited(root, file, change)
     with pytest.raises(ValueError, match=rf"000001.{message}"):
         of(root).reader.frame(name_of(made[0]))
+
+
+def test_a_pose_without_a_bin_is_refused_with_file_and_object(root, made):
+    """An object's centre in the camera has no side from which it is seen."""
+    centre = of(root).reader.centre("obj_000001")
+
+    def at_the_camera(data):
+        data["1"][0]["cam_R_m2c"] = np.eye(3).reshape(-1).tolist()
+        data["1"][0]["cam_t_m2c"] = (-1000.0 * centre).tolist()
+
+    edited(root, "scene_gt", at_the_camera)
+    target, distribution = of(root, min_visibility=0.0), SceneDistribution.of([Pose()])
+    with pytest.raises(
+        ValueError, match=r"000001\.png: pose of obj_000001: want a camera away from the object"
+    ):
+        target.load([name_of(made[0])], NAMES, 90, 120, distribution)
 
 
 def test_bad_files_are_refused(root, made):

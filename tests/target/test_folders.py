@@ -72,7 +72,9 @@ def test_a_box_is_the_whole_photograph_and_borders_are_cut_off(tmp_path):
     for images in parts.values():
         assert images.boxes.tolist() == [[[0.0, 4.0, 16.0, 12.0]]]
         assert images.images[0, :, 4:12, 4:].eq(1.0).all() and images.images[0, :, :4].eq(0.5).all()
-    with pytest.raises(ValueError, match=r"target\.border: 4 leaves nothing of .*photo\.png, of \(12, 8\)"):
+    with pytest.raises(
+        ValueError, match=r"target\.border: 4 leaves nothing of .*photo\.png, which has 12 x 8 pixels"
+    ):
         sets_of(FolderTarget(tmp_path, border=4))
 
 

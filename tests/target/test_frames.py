@@ -26,7 +26,7 @@ def item(**changes):
         ({"object_to_camera": np.diag([1.0, 1.0, 1.0, 2.0])}, "mug: want a rigid 4 x 4 object_to_camera"),
         (
             {"object_to_camera": np.diag([2.0, 1.0, 1.0, 1.0])},
-            r"mug: .* is no rotation, R R\^T is off the identity by 3",
+            r"mug: .* is no rotation: R R\^T differs from the identity by 3",
         ),
         ({"object_to_camera": np.diag([-1.0, 1.0, 1.0, 1.0])}, "mug: .* is a reflection"),
         ({"box": (3, 1, 3, 4)}, r"mug: want a box x0 < x1, y0 < y1, got \(3, 1, 3, 4\)"),
@@ -70,6 +70,6 @@ def test_camera_matrices_that_are_none():
     with pytest.raises(ValueError, match=r"^file: want \[\[fx, 0, cx\]"):
         camera_of_matrix([5, 0.1, 3, 0, 5, 2, 0, 0, 1], 8, 6, "file")  # skew
     with pytest.raises(
-        ValueError, match=r"^file: the principal point \(3, 5\.6\) lies outside of the image of 8 x 6"
+        ValueError, match=r"^file: the principal point \(3, 5\.6\) lies outside the image of 8 x 6"
     ):
         camera_of_matrix([5, 0, 3, 0, 5, 5.6, 0, 0, 1], 8, 6, "file")

@@ -20,7 +20,7 @@ def test_boxes_follow_their_photograph_and_small_ones_are_counted(tmp_path, capl
         images, placings = read([boxed, whole], 20, 20, 2.0, "here")
     assert images.boxes.tolist() == [[[2, 6, 12, 11], [15, 10, 20, 12.5]], [[0, 5, 20, 15], [0, 0, 0, 0]]]
     assert images.labels.tolist() == [[1, 2], [0, -1]] and images.bins.tolist() == [[3, -1], [-1, -1]]
-    assert "here: 1 boxes shorter than 2 px dropped" in caplog.text
+    assert "here: 1 boxes with a side below 2 px or outside their photographs are dropped" in caplog.text
     assert all(
         placing.inside(image).eq(1.0).all() for placing, image in zip(placings, images.images, strict=True)
     )
@@ -37,6 +37,6 @@ def test_a_border_is_cut_off_before_boxes_are_placed(tmp_path):
     image, placing = Photograph(tmp_path / "a.png", torch.tensor([0]), border=2).letterboxed(8, 8)
     assert bool(image.eq(1.0).all()) and (placing.width, placing.height) == (8, 8)
     with pytest.raises(
-        ValueError, match=r"target\.border: 6 leaves nothing of .*a\.png, of \(12, 12\) pixels"
+        ValueError, match=r"target\.border: 6 leaves nothing of .*a\.png, which has 12 x 12 pixels"
     ):
         Photograph(tmp_path / "a.png", torch.tensor([0]), border=6).letterboxed(8, 8)

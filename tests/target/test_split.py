@@ -117,7 +117,9 @@ def test_what_is_not_scored_is_divided_into_whole_groups() -> None:
     assert sorted(parts["train"] + parts["val"]) == val and len(parts["train"]) == 6
     assert not {groups[row] for row in parts["train"]} & {groups[row] for row in parts["val"]}
     assert Split().unscored(val, groups, seeded(2)) == {"val": val}
-    with pytest.raises(ValueError, match=r"those are of one, 0; want a larger target\.val_fraction"):
+    with pytest.raises(
+        ValueError, match=r"these all belong to one group, 0; want a larger target\.val_fraction"
+    ):
         Split(train_fraction=0.4).unscored([0, 1, 2], groups, seeded(2))
 
 

@@ -178,7 +178,9 @@ def test_every_so_manieth_frame_and_key_frames(root):
     assert numbers(parts["test"]) == ["0001/000002", "0001/000003"]  # all of them
     assert numbers(of(root, every=50, val_list="other").parts(0)["val"]) == ["0000/000003"]
     assert numbers(of(root, limit=2).parts(0)["val"]) == ["0000/000001", "0002/000001"]
-    with pytest.raises(ValueError, match=r"scenes \['0001'\] are in the part for validation and in the part"):
+    with pytest.raises(
+        ValueError, match=r"scenes \['0001'\] are both in the part for validation and in the part"
+    ):
         of(root, val_list="mixed")
     with pytest.raises(ValueError, match=r"target\.test_list: no such file: .*exam\.txt"):
         of(root, test_list="exam")
@@ -188,6 +190,25 @@ def test_every_so_manieth_frame_and_key_frames(root):
         of(root, val_list="absent")
     (root / "image_sets" / "train.txt").unlink()
     assert {name.scene for name in of(root).parts(0)["val"]} == {"0000", "0002"}
+
+
+def test_a_frame_is_listed_once_and_lines_are_counted_as_they_stand(root, caplog):
+    lists(
+        root, keyframe=["0001/000002", "", "0001/000003", "0001/000002"], wrong=["0001/000002", "", "0001/x"]
+    )
+    assert numbers(of(root).parts(0)["test"]) == ["0001/000002", "0001/000003"]
+    assert "keyframe.txt: 1 lines repeat a frame and are left out" in caplog.text
+    with pytest.raises(ValueError, match=r"wrong\.txt: line 3: want <scene>/<frame>, got '0001/x'"):
+        of(root, val_list="wrong")
+
+
+def test_names_of_frames_are_numbers(root, caplog):
+    folder = root / "data" / "0000"
+    (folder / "._000001-color.png").write_bytes(b"left by macOS")
+    assert len(of(root).reader.names) == 9 and "1 leftovers of other programs are left out" in caplog.text
+    (folder / "copy-color.png").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"copy-color\.png: want <number>-color\.png"):
+        of(root)
 
 
 def test_classes_that_are_no_objects(shared_root, caplog):
@@ -222,10 +243,16 @@ def test_hidden_and_small_objects_have_no_box(shared_root, caplog):
     seen = sorted(item.visibility for frame in frames for item in frame.objects)
     between = 0.5 * (seen[4] + seen[5])
     assert seen[4] < seen[5]
-    assert of(shared_root, min_visibility=between).load(names, NAMES, 90, 120).present.sum() == len(seen) - 5
+    with caplog.at_level(logging.INFO):
+        some = of(shared_root, min_visibility=between).load(names, NAMES, 90, 120)
+    assert some.present.sum() == len(seen) - 5
+    assert f"5 objects less visible than {between:g} (target.min_visibility) get no box" in caplog.text
     with caplog.at_level(logging.WARNING):
         none = of(shared_root, minimum_side=1000.0).load(names, NAMES, 90, 120)
-    assert not none.present.any() and f"{len(seen)} boxes shorter than 1000 px dropped" in caplog.text
+    assert not none.present.any()
+    assert (
+        f"{len(seen)} boxes with a side below 1000 px or outside their photographs are dropped" in caplog.text
+    )
 
 
 def test_several_cameras(root, made, caplog):
@@ -297,7 +324,7 @@ def _reflected(poses):
     [
         (lambda poses: {"poses": poses[..., :2]}, r"poses: want 3 x 4 x 3, one for each of cls_indexes, got 3 x 4 x 2"),
         (lambda poses: {"poses": _reflected(poses)}, r"poses: 035_power_drill: .* is a reflection"),
-        (lambda poses: {"poses": 1.1 * poses}, r"poses: 035_power_drill: .* is no rotation, R R\^T is off .* by 0\.21"),
+        (lambda poses: {"poses": 1.1 * poses}, r"poses: 035_power_drill: .* is no rotation: .* by 0\.21"),
         (lambda poses: {"poses": poses * np.nan}, r"poses: 035_power_drill: rotation: want 9 finite numbers"),
         (lambda poses: {"poses": None}, r"lacks \['poses'\]"),
         (lambda poses: {"cls_indexes": np.array([[15.0], [14.0], [99.0]])},
@@ -306,7 +333,7 @@ def _reflected(poses):
         (lambda poses: {"intrinsic_matrix": np.diag([0.0, 1.0, 1.0])},
          r"intrinsic_matrix: camera: fx and fy must be positive"),
         (lambda poses: {"intrinsic_matrix": MATRIX * [[3.0], [3.0], [1.0]]},
-         r"intrinsic_matrix: the principal point \(183, 130\.5\) lies outside of the image of 120 x 90"),
+         r"intrinsic_matrix: the principal point \(183, 130\.5\) lies outside the image of 120 x 90"),
     ],
 )  # fmt: skip
 def test_bad_meta_files_are_refused_with_file_and_key(root, made, change, message):

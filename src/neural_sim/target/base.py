@@ -98,16 +98,16 @@ class Photographs(Target):
 
     Args:
         val_fraction: fraction of the photographs in the validation set, on which psi is learned, as near as whole
-            groups allow; the rest is scored. Has no effect if the data set has its own parts.
+            groups allow; the others are scored. Has no effect if the data set has parts of its own.
         train_fraction: fraction of the unscored photographs that is for training (``training.real``), also in whole
             groups; the others are for validation. None: all are for validation.
-        split_by: which photographs form a group that must stay in one part, such as frames of one video, see
-            ``neural_sim.target.split.groups_of``; None: the data set's own groups, or else every photograph is its own
-            group, with a warning about near-duplicates in two parts.
+        split_by: what defines the group of a photograph, such as its video; groups stay in one part. See
+            ``neural_sim.target.split.groups_of``. None: the data set's own groups; if it has none, every photograph is
+            a group of its own, and near-duplicates in two parts give a warning.
         limit: largest number of photographs, counted and chosen as the subclass says; None: all.
         unmatched: what to do with a class of the data set that is not an object: ``refuse`` the data set, or
             ``leave_out`` the class.
-        minimum_side: boxes with a side shorter than this many pixels of the run's images are dropped and counted.
+        minimum_side: boxes with a side shorter than this, in pixels of the run's images, are dropped and counted.
     """
 
     renders: ClassVar[bool] = False
@@ -195,7 +195,7 @@ class AnnotatedPhotographs(Photographs):
         parts = self.split.parts_by_look(looks, generator, self.source)
         rows = {part: torch.tensor(own) for part, own in parts.items()}
         chosen = self.choose(images, rows, list(objects), distribution, generator)
-        return {part: images.select(own) for part, own in chosen.items()}
+        return labelled({part: images.select(own) for part, own in chosen.items()}, self.source)
 
     def choose(
         self,
@@ -207,3 +207,14 @@ class AnnotatedPhotographs(Photographs):
     ) -> Mapping[str, Int[Tensor, "_"]]:
         """Choose some of each part's ``rows``; by default, all of them."""
         return rows
+
+
+def labelled(parts: dict[str, LabelledImages], source: object) -> dict[str, LabelledImages]:
+    """Return the parts of ``source``; raise ``ValueError`` if no photograph in one of them shows an object."""
+    empty = [part for part, images in parts.items() if not bool(images.present.any())]
+    if empty:
+        raise ValueError(
+            f"{source}: no photograph of {' or '.join(empty)} has a box of an object; want more photographs of the "
+            "objects, or another split"
+        )
+    return parts

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from typing_extensions import override
 
 from neural_sim.documents import read_json
-from neural_sim.pictures import read_grid, read_header
+from neural_sim.pictures import by, read_grid, read_header
 from neural_sim.ranges import validated
 from neural_sim.target.frames import (
     Frame,
@@ -75,22 +75,23 @@ class BopTarget(PosedTarget):
         scenes = sorted(path.parent.name for path in folder.glob("*/scene_gt.json"))
         if not scenes:
             raise ValueError(f"{folder}: holds no scene (<scene>/scene_gt.json)")
-        chosen = []
-        for scene in scenes:
-            chosen += [
-                FrameName(f"{split}/{scene}", n)
-                for n in self.reader.numbers(f"{split}/{scene}")[:: self.every]
-            ]
-        return chosen
+        return [
+            FrameName(f"{split}/{scene}", number)
+            for scene in scenes
+            for number in self.reader.numbers(f"{split}/{scene}")[:: self.every]
+        ]
 
 
 def _targets(path: Path) -> list[FrameName]:
-    entries = read_json(path)
+    entries, names = read_json(path), set()
     if not isinstance(entries, list):
         raise ValueError(f"{path}: want a list of targets")
     for number, entry in enumerate(entries):
-        _want(entry, ("scene_id", "im_id"), f"{path}: [{number}]")
-    return sorted({FrameName(f"test/{int(entry['scene_id']):06d}", int(entry["im_id"])) for entry in entries})
+        where = f"{path}: [{number}]"
+        _want(entry, ("scene_id", "im_id"), where)
+        scene, image = (_whole(entry[key], f"{where}: {key}") for key in ("scene_id", "im_id"))
+        names.add(FrameName(f"test/{scene:06d}", image))
+    return sorted(names)
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class BopScenes(FrameReader):
     """The files of a BOP data set.
 
     An object's centre is the centre of its box in ``models/models_info.json`` or, without that file, the origin of its
-    poses; its visibility is ``visib_fract``.
+    poses; its visibility is ``visib_fract``. Its box is that of its mask or, without one, ``bbox_visib``.
     """
 
     root: Path
@@ -147,21 +148,23 @@ class BopScenes(FrameReader):
     def _object_of(
         self, name: FrameName, index: int, pose: Any, info: Any, size: tuple[int, int]
     ) -> PosedObject:
-        where = f"{self._folder(name) / 'scene_gt.json'}: {name.number}[{index}]"
+        where, said = (
+            f"{self._folder(name) / file}: {name.number}[{index}]"
+            for file in ("scene_gt.json", "scene_gt_info.json")
+        )
         _want(pose, ("obj_id", "cam_R_m2c", "cam_t_m2c"), where)
-        _want(info, ("visib_fract", "bbox_visib"), where.replace("scene_gt.json", "scene_gt_info.json"))
+        _want(info, ("visib_fract", "bbox_visib"), said)
         moved = rigid(
             pose["cam_R_m2c"], numbers(pose["cam_t_m2c"], 3, f"{where}: cam_t_m2c") * MILLIMETRE, where
         )
-        file = self._folder(name) / "mask_visib" / f"{name.number:06d}_{index:06d}.png"
+        file = self._mask(name, index)
         mask = read_grid(file, size) > 0 if file.is_file() else None
         if mask is not None:
             box = box_of_mask(mask)
         else:
             # The toolkit's width and height are differences between last and first pixels.
-            x, y, width, height = numbers(info["bbox_visib"], 4, f"{where}: bbox_visib").tolist()
+            x, y, width, height = numbers(info["bbox_visib"], 4, f"{said}: bbox_visib").tolist()
             box = (x, y, x + width + 1, y + height + 1) if width >= 0 and height >= 0 else None
-        said = where.replace("scene_gt.json", "scene_gt_info.json")
         visible = float(numbers(info["visib_fract"], 1, f"{said}: visib_fract")[0])
         if not 0.0 <= visible <= 1.0:
             raise ValueError(f"{said}: visib_fract: want a fraction from 0 to 1, got {visible:g}")
@@ -176,7 +179,7 @@ class BopScenes(FrameReader):
         said = (entry.get("width", size[0]), entry.get("height", size[1]))
         if said != size:
             raise ValueError(
-                f"{where}: is of images of {said[0]} x {said[1]}, {self._image(name)} is {size[0]} x {size[1]}"
+                f"{where}: is for images of {by(said)} pixels, {self._image(name)} has {by(size)}"
             )
         return camera_of_matrix(entry["cam_K"], *size, f"{where}: cam_K")
 
@@ -228,6 +231,9 @@ class BopScenes(FrameReader):
     def _folder(self, name: FrameName) -> Path:
         return self.root / name.scene
 
+    def _mask(self, name: FrameName, index: int) -> Path:
+        return self._folder(name) / "mask_visib" / f"{name.number:06d}_{index:06d}.png"
+
     def _image(self, name: FrameName) -> Path:
         return self._file(name, IMAGES)
 
@@ -240,15 +246,24 @@ class BopScenes(FrameReader):
     def files(self, name: FrameName) -> list[Path]:
         folder = self._folder(name)
         labels = [folder / file for file in ("scene_gt.json", "scene_gt_info.json", "scene_camera.json")]
-        masks = (folder / "mask_visib").glob(f"{name.number:06d}_*.png")
+        shown = self._entry(name, "scene_gt.json")
+        masks = (self._mask(name, index) for index in range(len(shown) if isinstance(shown, list) else 0))
         return [*labels, self._image(name), *masks, *([self._info_file] if self._info else [])]
 
 
 def _class_name(number: int | str, where: str) -> str:
+    return f"obj_{_whole(number, where):06d}"
+
+
+def _whole(value: Any, where: str) -> int:
+    """Return a number from 0, which a file may write as 3, 3.0 or "3"."""
     try:
-        return f"obj_{int(number):06d}"
-    except (TypeError, ValueError):
-        raise ValueError(f"{where}: want an object's number, got {number!r}") from None
+        number = int(value)
+        if number < 0 or float(value) != number:
+            raise ValueError
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{where}: want a whole number of at least 0, got {value!r}") from None
+    return number
 
 
 def _want(entry: Any, keys: Sequence[str], where: str) -> None:
@@ -260,6 +275,6 @@ def _want(entry: Any, keys: Sequence[str], where: str) -> None:
 def _mapping(path: Path) -> dict[str, Any]:
     """Read a JSON file of entries by number. Raises ``ValueError`` for any other file."""
     data = read_json(path)
-    if not isinstance(data, dict) or not all(key.isdigit() for key in data):
+    if not isinstance(data, dict) or not all(key.isdecimal() for key in data):
         raise ValueError(f"{path}: want entries by number")
     return {str(int(key)): value for key, value in data.items()}

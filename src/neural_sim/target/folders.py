@@ -38,8 +38,8 @@ class FolderTarget(AnnotatedPhotographs):
     See ``Photographs`` for the other arguments; ``minimum_side`` has no effect.
 
     Raises:
-        ValueError: there is no such folder, no folder in it has photographs, a folder that ``classes`` names does not
-            exist, a number is out of its range, or ``split_by`` does not give two or more groups.
+        ValueError: there is no such folder, it has no folders, one that is read has no photographs, ``classes`` names a
+            folder that does not exist, a number is out of its range, or ``split_by`` gives fewer than two groups.
     """
 
     boxed: ClassVar[bool] = False

@@ -144,7 +144,7 @@ def rigid(rotation: Any, translation: Any, where: str) -> Float[np.ndarray, "4 4
         kind = (
             "a reflection"
             if off <= ROTATION_TOLERANCE
-            else f"no rotation, R R^T is off the identity by {off:.2g}"
+            else f"no rotation: R R^T differs from the identity by {off:.2g}"
         )
         raise ValueError(f"{where}: {turn.tolist()} is {kind}")
     return pose
@@ -177,7 +177,7 @@ def camera_of_matrix(matrix: Any, width: int, height: int, where: str) -> Pinhol
         raise ValueError(f"{where}: want [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {k.tolist()}")
     if not (-0.5 <= k[0, 2] <= width - 0.5 and -0.5 <= k[1, 2] <= height - 0.5):
         raise ValueError(
-            f"{where}: the principal point ({k[0, 2]:g}, {k[1, 2]:g}) lies outside of the image of {width} x {height}"
+            f"{where}: the principal point ({k[0, 2]:g}, {k[1, 2]:g}) lies outside the image of {width} x {height}"
         )
     try:
         return opencv_camera(width, height, *(float(k[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))))

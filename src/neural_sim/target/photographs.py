@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from neural_sim.pictures import PHOTO_SUFFIXES, eight_bits, picture_files, read_picture
+from neural_sim.pictures import PHOTO_SUFFIXES, by, eight_bits, picture_files, read_picture
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -167,7 +167,7 @@ class Photograph:
             return letterbox(photo, height, width)
         if min(photo.size) <= 2 * self.border:
             raise ValueError(
-                f"target.border: {self.border} leaves nothing of {self.path}, of {photo.size} pixels"
+                f"target.border: {self.border} leaves nothing of {self.path}, which has {by(photo.size)} pixels"
             )
         return letterbox(ImageOps.crop(photo, self.border), height, width)
 
@@ -181,8 +181,8 @@ def read(
         photographs: at least one.
         height: height of the images, in pixels.
         width: width of the images, in pixels.
-        minimum_side: boxes with a shorter side, in pixels of the images, are dropped and counted in the log. A box that
-            is the whole photograph is kept.
+        minimum_side: boxes with a shorter side, in pixels of the images, are dropped and counted in the log, and so are
+            boxes outside their photographs. A box that is the whole photograph is kept.
         source: the data set, for the log.
 
     Returns:
@@ -203,7 +203,10 @@ def read(
         kept.append(labelled)
         dropped += len(photograph.labels) - len(labelled.labels)
     if dropped:
-        _log.warning("%s: %d boxes shorter than %g px dropped", source, dropped, minimum_side)
+        _log.warning(
+            "%s: %d boxes with a side below %g px or outside their photographs are dropped",
+            source, dropped, minimum_side,
+        )  # fmt: skip
     return padded(torch.stack(images), kept), placings
 
 
@@ -217,12 +220,13 @@ class Boxes:
 
 
 def _placed(photograph: Photograph, placing: Letterbox, minimum_side: float) -> Boxes:
-    """Map a photograph's boxes into the letterboxed image, without those that are too small there."""
+    """Map a photograph's boxes into the letterboxed image, without those that are too small or outside it."""
     if photograph.boxes is None:
         whole = torch.tensor([[0.0, 0.0, placing.width, placing.height]])
         return Boxes(placing.boxes(whole), photograph.labels, photograph.bins)
     boxes = placing.boxes(photograph.boxes)
-    large = ((boxes[:, 2:] - boxes[:, :2]) >= minimum_side).all(-1)
+    sides = boxes[:, 2:] - boxes[:, :2]
+    large = ((sides >= minimum_side) & (sides > 0.0)).all(-1)
     bins = None if photograph.bins is None else photograph.bins[large]
     return Boxes(boxes[large], photograph.labels[large], bins)
 

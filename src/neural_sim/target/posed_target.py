@@ -20,7 +20,7 @@ from neural_sim.randomness import stream
 from neural_sim.ranges import Fraction, PositiveInt
 from neural_sim.synthesis.subjects import RenderedSubject
 from neural_sim.synthesis.synthesizer import Synthesizer
-from neural_sim.target.base import Photographs
+from neural_sim.target.base import Photographs, labelled
 from neural_sim.target.classes import ClassMap
 from neural_sim.target.frames import Frame, FrameName, FrameReader, Listed, PosedObject
 from neural_sim.target.photographs import Photograph, read
@@ -38,8 +38,8 @@ class PosedTarget(Photographs):
     """Photographs with poses. They are divided before any is read, by scene unless ``split_by`` is given.
 
     A subclass lists the photographs (``listed``) and provides their ``reader``. ``split_by`` is searched for in
-    ``<scene>/<number>``; None: the photographs of a scene belong together. If a part has more photographs than
-    ``limit``, evenly spaced ones are taken.
+    ``<scene>/<number>``, where BOP's scenes include their folder (``test/000001``); None: the photographs of a scene
+    belong together. If a part has more photographs than ``limit``, evenly spaced ones are taken.
 
     Args:
         root: the data set's folder.
@@ -100,7 +100,7 @@ class PosedTarget(Photographs):
         both = sorted(set(scenes) & {name.scene for name in listed.test or ()})
         if both:
             raise ValueError(
-                f"{self._root}: scenes {both} are in the part for validation and in the part that is scored"
+                f"{self._root}: scenes {both} are both in the part for validation and in the part that is scored"
             )
         if listed.test is None and self.split_by is None and len(scenes) < 2:
             raise ValueError(
@@ -162,7 +162,7 @@ class PosedTarget(Photographs):
             )
         if count < len(names):
             _log.warning(
-                "%s: %d of %d photographs were taken by other cameras than the one that images are synthesised for",
+                "%s: %d of %d photographs were taken by other cameras than the one of synthesised images",
                 self._root, len(names) - count, len(names),
             )  # fmt: skip
         return camera
@@ -186,7 +186,7 @@ class PosedTarget(Photographs):
                 "%s: %s has %d photographs of scenes %s; boxes in each pose bin, from 1: %s", self._root, part,
                 len(frames), ", ".join(sorted({frame.scene for frame in frames})), boxes_by_bin(made[part], names),
             )  # fmt: skip
-        return made
+        return labelled(made, self._root)
 
     def load(
         self,
@@ -209,13 +209,20 @@ class PosedTarget(Photographs):
         if unknown:
             raise ValueError(f"target.classes: {unknown} are not objects; objects are {list(objects)}")
         labels = self._class_map.labels(self.class_names, objects)
-        photographs, left_out = [], Counter()
+        photographs, left_out, hidden = [], Counter(), 0
         for name in names:
             frame = self.reader.frame(name)
             left_out.update(self._strange(frame, labels, objects))
             photographs.append(self._photograph(frame, labels, distribution, radii or {}))
+            shown = [item for item in frame.objects if labels.get(item.name) is not None]
+            hidden += len(shown) - len(photographs[-1].labels)
         if left_out:
             _log.info("%s: boxes of classes that are not objects left out: %s", self._root, dict(left_out))
+        if hidden:
+            _log.info(
+                "%s: %d objects less visible than %g (target.min_visibility) get no box",
+                self._root, hidden, self.min_visibility,
+            )  # fmt: skip
         return read(photographs, height, width, self.minimum_side, self._root)[0]
 
     @property
@@ -223,14 +230,14 @@ class PosedTarget(Photographs):
         return ClassMap(self.classes, self._root, unmatched=self.unmatched)
 
     def _strange(self, frame: Frame, labels: Mapping[str, int | None], objects: Sequence[str]) -> list[str]:
-        """List the classes of a photograph that are not objects, unless these are refused."""
-        strange = [item.name for item in frame.objects if item.name not in labels]
+        """List the classes of a photograph's boxes that are not objects, unless these are refused."""
+        strange = [item for item in frame.objects if item.name not in labels]
         if strange and self.unmatched == "refuse":
             raise ValueError(
-                f"{frame.image}: shows {strange[0]}, which is not an object; objects are {list(objects)}. Map it by "
-                "target.classes, {name: object} or {name: null}, or set target.unmatched=leave_out"
+                f"{frame.image}: shows {strange[0].name}, which is not an object; objects are {list(objects)}. Map it "
+                "by target.classes, {name: object} or {name: null}, or set target.unmatched=leave_out"
             )
-        return strange
+        return [item.name for item in strange if item.box is not None]
 
     def _photograph(
         self,
@@ -246,7 +253,10 @@ class PosedTarget(Photographs):
                 continue
             boxes.append(item.box)
             own.append(label)
-            bins.append(self._bin(item, distribution, radii))
+            try:
+                bins.append(self._bin(item, distribution, radii))
+            except ValueError as error:
+                raise ValueError(f"{frame.image}: pose of {item.name}: {error}") from error
         return Photograph(
             frame.image,
             torch.tensor(own, dtype=torch.long),

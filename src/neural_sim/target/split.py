@@ -107,9 +107,8 @@ class Split:
         own = [groups[row] for row in rows]
         if len(set(own)) < 2:
             raise ValueError(
-                "target.train_fraction takes whole groups of the images that are not scored, and those are of one, "
-                f"{own[0]!r}; want a larger target.val_fraction, which is the part that is not scored, or smaller "
-                "groups"
+                "target.train_fraction takes whole groups of the images that are not scored, but these all belong to "
+                f"one group, {own[0]!r}; want a larger target.val_fraction (all that is not scored) or smaller groups"
             )
         train, rest = split(own, self.train_fraction, generator, ("training", "validation"))
         return {"train": [rows[row] for row in train.tolist()], "val": [rows[row] for row in rest.tolist()]}
@@ -145,7 +144,7 @@ class Split:
             if found.second:
                 _log.warning(
                     "%s: %d of %d %s images look like one of %s (%s like %s); if they are of one video, scene or "
-                    "capture, keep them together by target.split_by",
+                    "capture, keep them in one part by target.split_by",
                     source, len(found.second), found.compared, second, first,
                     looks[parts[second][found.second[0]]].name, looks[parts[first][found.first[0]]].name,
                 )  # fmt: skip
@@ -236,7 +235,7 @@ def split(
     wanted = round(fraction * len(groups))
     if not 0 < wanted < len(groups):
         raise ValueError(
-            f"target: {fraction} of {len(groups)} images leaves {first} or {second} empty; give more images"
+            f"target: {fraction} of {len(groups)} images leaves {first} or {second} empty; want more images"
         )
     members: dict[Hashable, list[int]] = {}
     for row, group in enumerate(groups):

@@ -7,6 +7,7 @@ line <scene>/<frame> for each frame.
 
 from __future__ import annotations
 
+import logging
 import struct
 import zlib
 from collections.abc import Collection, Sequence
@@ -19,7 +20,7 @@ import scipy.io
 from typing_extensions import override
 
 from neural_sim.extras import require
-from neural_sim.pictures import read_grid, read_header
+from neural_sim.pictures import read_grid, read_header, without_leftovers
 from neural_sim.ranges import validated
 from neural_sim.target.frames import (
     Frame,
@@ -34,6 +35,8 @@ from neural_sim.target.frames import (
 )
 from neural_sim.target.posed_target import PosedTarget
 from neural_sim.types import PinholeCamera
+
+_log = logging.getLogger(__name__)
 
 CLASSES = (
     "002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle",
@@ -99,14 +102,17 @@ class YcbVideoTarget(PosedTarget):
             if given is None:
                 return None
             raise ValueError(f"target.{key}: no such file: {path}")
-        names = []
-        for number, line in enumerate(_text(path).split(), 1):
+        found = []
+        for number, line in enumerate(map(str.strip, _text(path).splitlines()), 1):
             scene, _, frame = line.removeprefix("data/").rpartition("/")
-            if scene == "data_syn":  # rendered images, which do not belong to the target
+            if not line or scene == "data_syn":  # rendered images, which do not belong to the target
                 continue
-            if not scene or "/" in scene or not frame.isdigit():
+            if not scene or "/" in scene or not frame.isdecimal():
                 raise ValueError(f"{path}: line {number}: want <scene>/<frame>, got {line!r}")
-            names.append(FrameName(scene, int(frame)))
+            found.append(FrameName(scene, int(frame)))
+        names = list(dict.fromkeys(found))
+        if len(names) < len(found):
+            _log.warning("%s: %d lines repeat a frame and are left out", path, len(found) - len(names))
         absent = [name for name in names if not self.reader.file(name, "color.png").is_file()]
         if absent:
             raise ValueError(
@@ -119,19 +125,28 @@ class YcbVideoTarget(PosedTarget):
 class YcbVideoScenes(FrameReader):
     """The files of YCB-Video. An object's centre is assumed to be the origin of its poses.
 
-    An object's visibility is the fraction of the box of its whole projection (clipped to the image) that the box of its
-    visible pixels covers, because the data set has no masks of whole objects.
+    An object's box is that of its pixels in ``-label.png``. Its visibility is the fraction of the box of its whole
+    projection (clipped to the image) that this box covers, because the data set has no masks of whole objects. Without
+    ``-label.png``, the box of the whole projection is taken, and the object counts as visible.
     """
 
     root: Path
 
     @cached_property
     def names(self) -> list[FrameName]:
-        """All photographs."""
-        found = (self.root / "data").glob("*/*-color.png")
-        return sorted(
-            FrameName(path.parent.name, int(path.name.removesuffix("-color.png"))) for path in found
-        )
+        """All photographs.
+
+        Raises:
+            ValueError: the name of a photograph has no number.
+        """
+        folder = self.root / "data"
+        names = []
+        for path in without_leftovers(sorted(folder.glob("*/*-color.png")), folder):
+            frame = path.name.removesuffix("-color.png")
+            if not frame.isdecimal():
+                raise ValueError(f"{path}: want <number>-color.png")
+            names.append(FrameName(path.parent.name, int(frame)))
+        return sorted(names)
 
     @override
     def class_names(self, scenes: Collection[str]) -> list[str]:
