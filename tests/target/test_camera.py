@@ -21,7 +21,8 @@ ENTRY = {"width": 64, "height": 48, "fx": 80.0, "fy": 72.0, "cx": 30.0, "cy": 25
 def labels(folder, **changes):
     Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(folder / "a.png")
     document = {"images": [{"id": 1, "file_name": "a.png", "width": 64, "height": 48}],
-                "categories": [{"id": 1, "name": "mug"}], "annotations": [], "camera": ENTRY}  # fmt: skip
+                "categories": [{"id": 1, "name": "mug"}], "camera": ENTRY,
+                "annotations": [{"image_id": 1, "category_id": 1, "bbox": [8, 8, 20, 20]}]}  # fmt: skip
     path = folder / "labels.json"
     path.write_text(json.dumps({**document, **changes}))
     return path
@@ -73,8 +74,14 @@ def test_the_targets_own_camera_in_another_size(tmp_path):
         ({"camera": {k: v for k, v in ENTRY.items() if k != "fy"}}, r"labels.json: camera: .*fy"),
         ({"camera": {**ENTRY, "fx": "wide"}}, r"labels.json: camera: .*fx"),
         ({"camera": {**ENTRY, "fx": 0}}, r"labels.json: camera: .*positive"),
-        ({"camera": [1, 2]}, r"labels.json: camera: want numbers"),
-        ({"camera": {**ENTRY, "width": 65}}, r"labels.json: a.png has .*64.*, its camera .*65"),
+        ({"camera": [1, 2]}, r"labels.json: camera: want whole numbers width, height"),
+        ({"camera": {**ENTRY, "width": 64.5}}, r"labels.json: camera: .*unknown: width$"),
+        ({"camera": {**ENTRY, "height": float("inf")}}, r"labels.json: camera: .*unknown: height$"),
+        ({"camera": {**ENTRY, "width": 65}}, r"labels.json: a.png has 64 x 48 pixels, its camera 65 x 48"),
+        (
+            {"camera": {**ENTRY, "width": 128, "height": 96}, "images": [{"id": 1, "file_name": "a.png"}]},
+            r"labels.json: a.png has 64 x 48 pixels, its camera 128 x 96",
+        ),
     ],
 )
 def test_a_camera_entry_that_is_none_is_named(tmp_path, changes, message):

@@ -59,7 +59,10 @@ def test_letterboxed_images_and_boxes_by_hand(tmp_path: Path, caplog: pytest.Log
     assert inside[:, 27 - 1 : 27 + 26].any(0).sum() == 27  # round(10 * 80 / 30)
     assert inside.any(1).all()
     assert loaded.bins.tolist() == [-1, -1]
-    assert "1 boxes shorter than 2 px dropped" in caplog.text and "no category for object can" in caplog.text
+    assert (
+        "1 boxes with a side below 2 px or outside their photographs are dropped" in caplog.text
+        and "no category for object can" in caplog.text
+    )
 
 
 def test_round_trip_through_the_export(tmp_path: Path) -> None:
@@ -93,7 +96,11 @@ def test_categories_that_are_no_objects_can_be_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Their boxes are counted, the photographs stay."""
-    boxes = [{"image_id": 2, "category_id": id, "bbox": [4, 2, 20, 10]} for id in (7, 8, 8)]
+    boxes = [
+        {"image_id": 2, "category_id": id, "bbox": [4, y, 20, 10]}
+        for id, y in ((7, 2), (8, 2), (8, 4), (8, 4))
+    ]
+    boxes += [{"image_id": 2, "category_id": 8, "bbox": [0, 0, 30, 20], "iscrowd": 1}]
     path = write(tmp_path, categories=[{"id": 7, "name": "mug"}, {"id": 8, "name": "dog"}], annotations=boxes)
     with caplog.at_level(logging.INFO):
         loaded = CocoTarget(path, unmatched="leave_out").load(NAMES, 80, 80)
@@ -118,10 +125,17 @@ def test_the_digest_follows_the_contents_of_labels_and_photos(tmp_path: Path) ->
     held[-1] ^= 1  # the size stays
     photo.write_bytes(held)
     digests.append(CocoTarget(path).digest())
-    write(tmp_path, annotations=[])
+    write(tmp_path, annotations=[{"image_id": 2, "category_id": 7, "bbox": [4, 2, 20, 10]}])
     digests.append(CocoTarget(path).digest())
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
+
+
+BOTH = [
+    {"image_id": image, "category_id": 7, "bbox": box}
+    for image, box in ((2, [4, 2, 20, 10]), (2, [30, 10, 10, 5]), (9, [1, 2, 8, 20]))
+]
+"""Boxes on both photographs of ``write``."""
 
 
 def sets_of(target: CocoTarget, seed: int = 3) -> dict[str, LabelledImages]:
@@ -134,12 +148,29 @@ def sets_of(target: CocoTarget, seed: int = 3) -> dict[str, LabelledImages]:
 
 def test_sets_split_the_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
-        made = sets_of(CocoTarget(write(tmp_path), val_fraction=0.5))
+        made = sets_of(CocoTarget(write(tmp_path, annotations=BOTH), val_fraction=0.5))
     assert {name: part.images.shape for name, part in made.items()} == {
         "val": (1, 3, 16, 24), "test": (1, 3, 16, 24),
     }  # fmt: skip
-    assert {len(made[name].labels[made[name].present]) for name in made} == {0, 2}
+    assert {len(made[name].labels[made[name].present]) for name in made} == {1, 2}
     assert "look like" not in caplog.text
+
+
+def test_a_part_without_a_box_is_refused(tmp_path: Path) -> None:
+    """One of the two photographs shows nothing: scores on it alone would say nothing."""
+    with pytest.raises(
+        ValueError, match=r"annotations\.json: no photograph of (val|test) has a box of an object"
+    ):
+        sets_of(CocoTarget(write(tmp_path), val_fraction=0.5))
+    with pytest.raises(ValueError, match=r"annotations\.json: no photograph of val or test has a box"):
+        sets_of(CocoTarget(write(tmp_path, annotations=BOTH), categories={"mug": None}, val_fraction=0.5))
+
+
+def test_boxes_outside_their_photograph_are_dropped_at_any_smallest_side(tmp_path: Path) -> None:
+    """At a smallest side of 0, a box that was clipped to a line would be left."""
+    outside = [{"image_id": 2, "category_id": 7, "bbox": [50, 5, 9, 9]}]
+    loaded = CocoTarget(write(tmp_path, annotations=[*BOTH, *outside]), minimum_side=0.0).load(NAMES, 80, 80)
+    assert loaded.present.sum(1).tolist() == [2, 1]
 
 
 SCENES = {"kitchen": 5, "hall": 4, "yard": 3}
@@ -193,7 +224,7 @@ def test_frames_of_a_scene_in_both_parts_are_warned_of(
     shared = set(scenes_in(made["val"])) & set(scenes_in(made["test"]))
     alike = sum(scene in shared for scene in scenes_in(made["test"]))
     assert alike and f"val.json: {alike} of 8 test images look like one of val (" in caplog.text
-    assert "keep them together by target.split_by" in caplog.text
+    assert "keep them in one part by target.split_by" in caplog.text
 
 
 def test_groups_are_checked_before_any_photo_is_read(tmp_path: Path) -> None:
@@ -246,14 +277,18 @@ def test_pose_bins_that_are_none_are_refused(tmp_path: Path) -> None:
         ValueError, match=r"bin_attribute='pose': bin 9 of an annotation is beyond the 8 of pose"
     ):
         sets_of(CocoTarget(tagged(tmp_path, 3, 9), bin_attribute="pose", val_fraction=0.5))
-    made = sets_of(CocoTarget(tagged(tmp_path, 3, 8), bin_attribute="pose", val_fraction=0.5))
-    assert sorted(b for part in made.values() for b in part.bins[part.present].tolist()) == [2, 7]
+    target = CocoTarget(tagged(tmp_path, 3, 8), bin_attribute="pose")
+    found = target.photographs(NAMES, SceneDistribution.of([Pose()]))
+    assert [photograph.bins.tolist() for photograph in found if photograph.bins is not None] == [
+        [2, 7, 4],
+        [],
+    ]
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"images": []}, "holds no images"),
+        ({"images": []}, "has no images"),
         ({"annotations": None}, "want a list 'annotations'"),
         ({"images": [{"id": 1}]}, r"images\[0\] lacks \['file_name'\]"),
         ({"annotations": [{"image_id": 2, "category_id": 7, "bbox": [1, 2]}]}, "bbox must be"),

@@ -116,7 +116,7 @@ def test_turned_pictures_without_a_listed_size_are_warned_of(
     turn(made, width=None, height=0)
     with caplog.at_level(logging.WARNING):
         assert made.boxes() == PLAIN
-    assert "4 photographs without width and height are turned by EXIF, such as" in caplog.text
+    assert "4 photographs are turned by EXIF and listed without width and height, such as" in caplog.text
 
 
 def test_other_sizes_and_damaged_pictures_are_refused_before_any_is_read(made: Made) -> None:
@@ -137,17 +137,22 @@ def test_an_id_of_several_images_is_refused(made: Made) -> None:
         entry["id"] = 20250116
     for item in made.annotations:
         item["image_id"] = 20250116
-    made.refused(r"images\[0\] and \[1\] \('000\.png' and '001\.png'\) have one id, 20250116")
+    made.refused(r"images\[0\] and \[1\] \('000\.png' and '001\.png'\) have the same id, 20250116")
 
 
 def test_a_file_of_several_images_is_refused(made: Made) -> None:
     made.images[3]["file_name"] = "000.png"
-    made.refused(r"images\[0\] and \[3\] \(1 and 4\) have one file_name, '000\.png'")
+    made.refused(r"images\[0\] and \[3\] \(1 and 4\) have the same file_name, '000\.png'")
+
+
+def test_a_file_of_several_images_is_refused_in_any_spelling(made: Made) -> None:
+    made.images[3]["file_name"] = "./000.png"
+    made.refused(r"images\[0\] and \[3\] \(1 and 4\) have the same file_name, '\./000\.png'")
 
 
 def test_an_id_of_several_categories_is_refused(made: Made) -> None:
     made.categories.append({"id": 1, "name": "can"})
-    made.refused(r"categories\[0\] and \[1\] \('mug' and 'can'\) have one id, 1")
+    made.refused(r"categories\[0\] and \[1\] \('mug' and 'can'\) have the same id, 1")
 
 
 def test_ids_of_another_type_are_refused_where_no_annotation_has_an_image(made: Made) -> None:

@@ -120,7 +120,7 @@ def test_turned_boxes_of_cvat_become_the_upright_ones_about_them(tmp_path: Path,
     made = document(pictures(tmp_path, NAMES), attributes={"rotation": 90.0})
     with caplog.at_level(logging.WARNING):
         boxes = CocoTarget(written(tmp_path / "a.json", made)).load(["mug"], 60, 80).boxes[:, 0]
-    assert np.allclose(boxes[0], [15, 10, 35, 40]) and "3 boxes are turned" in caplog.text
+    assert np.allclose(boxes[0], [15, 10, 35, 40]) and "3 boxes are rotated" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -134,9 +134,19 @@ def test_files_without_a_box_that_counts_are_refused(
     tmp_path: Path, caplog: Any, change: Any, said: str
 ) -> None:
     path = written(tmp_path / "a.json", document(pictures(tmp_path, NAMES), **change))
-    with pytest.raises(ValueError, match=r"a\.json: holds no box of anything"):
+    with pytest.raises(ValueError, match=r"a\.json: has no usable box"):
         CocoTarget(path).load(["mug"], 60, 80)
     assert any(re.search(said, record.message) for record in caplog.records)
+
+
+def test_a_box_like_that_of_a_crowd_counts(tmp_path: Path, caplog: Any) -> None:
+    """CVAT writes iscrowd=1 for a mask, and an object may have a rectangle of the same size besides."""
+    made = document(pictures(tmp_path, NAMES))
+    made["annotations"] = [
+        row for item in made["annotations"] for row in ({**item, "id": 100 + item["id"], "iscrowd": 1}, item)
+    ]
+    assert CocoTarget(written(tmp_path / "a.json", made)).load(["mug"], 60, 80).present.sum() == 3
+    assert "repeat an earlier one" not in caplog.text
 
 
 def test_boxes_that_come_twice_count_once_and_those_beyond_the_picture_are_told(
@@ -146,7 +156,7 @@ def test_boxes_that_come_twice_count_once_and_those_beyond_the_picture_are_told(
     made["annotations"] += [{**item, "id": 100 + item["id"]} for item in made["annotations"][:2]]
     made["annotations"][2]["bbox"] = [30, 20, 60, 30]
     found = CocoTarget(written(tmp_path / "a.json", made)).load(["mug"], 60, 80)
-    assert found.present.sum() == 3 and "2 boxes come twice and are left out once" in caplog.text
+    assert found.present.sum() == 3 and "2 boxes repeat an earlier one and are left out" in caplog.text
     assert "1 of 5 boxes reach beyond their pictures and are clipped, such as annotations[2]" in caplog.text
 
 
@@ -154,7 +164,10 @@ def test_boxes_that_come_twice_count_once_and_those_beyond_the_picture_are_told(
     ("box", "reason"),
     [
         ([0.1, 0.2, 0.4, 0.5], "all boxes lie in the first pixel, .*in pixels, not fractions"),
-        ([30, 25, 70, 55], "3 of 3 boxes reach beyond their pictures and none would as two corners"),
+        (
+            [30, 25, 70, 55],
+            "3 of 3 boxes reach beyond their pictures, but none would if its numbers were two",
+        ),
         ([200, 200, 30, 30], "no box lies on its picture"),
     ],
 )
@@ -170,7 +183,7 @@ def test_boxes_in_other_terms_are_refused(tmp_path: Path, box: list[float], reas
     ("name", "content", "reason"),
     [
         ("data.yaml", "path: .\ntrain: images/train\nnames: [mug]\n", "YOLO format; want COCO's JSON: .*from_yolo"),
-        ("annotations.xml", "<annotations/>", "Pascal VOC's or CVAT's format; want COCO's JSON"),
+        ("annotations.xml", "<annotations/>", "Pascal VOC or CVAT format; want COCO's JSON"),
         ("ls.json", [{"id": 1, "data": {"image": "/data/a.jpg"}}], "this is Label Studio's own format: export as COCO"),
         ("results.json", [{"image_id": 1, "bbox": [1, 2, 3, 4], "score": 0.5}], "this is a list of detections"),
         ("via.json", {"_via_settings": {}, "_via_img_metadata": {}}, "this is VIA's project: export .* as COCO"),
@@ -190,7 +203,7 @@ def test_a_folder_is_refused_with_the_files_that_may_be_meant(tmp_path: Path) ->
     written(tmp_path / "yolo" / "data.yaml", "names: [mug]")
     roboflow(tmp_path / "flow")
     with pytest.raises(
-        ValueError, match=r"target\.annotations: .*data\.yaml is of a data set in YOLO format"
+        ValueError, match=r"target\.annotations: .*data\.yaml belongs to a data set in YOLO format"
     ):
         CocoTarget(tmp_path / "yolo")
     with pytest.raises(

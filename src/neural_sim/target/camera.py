@@ -102,20 +102,20 @@ def camera_of_entry(entry: Any, where: str) -> PinholeCamera:
     """Return the camera of a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` (OpenCV, pixels).
 
     Raises:
-        ValueError: a key is missing, unknown (photographs with distortion must be undistorted first) or not a
-            number; the message has ``where``.
+        ValueError: a key is missing or unknown (photographs with distortion must be undistorted first), or its value
+            is not a number, a whole one for a side; the message has ``where``.
     """
-    keys = ("width", "height", "fx", "fy", "cx", "cy")
-    got = entry if isinstance(entry, dict) else {}
-    wrong = sorted(
-        {*(set(got) ^ set(keys)), *(k for k in keys if k in got and type(got[k]) not in (int, float))}
-    )
-    if wrong or not isinstance(entry, dict):
+    sides, others = ("width", "height"), ("fx", "fy", "cx", "cy")
+    keys, got = {*sides, *others}, entry if isinstance(entry, dict) else {}
+    wrong = keys ^ set(got)
+    wrong |= {key for key in keys & set(got) if type(got[key]) not in (int, float)}
+    wrong |= {key for key in sides if type(got.get(key)) is float and not got[key].is_integer()}
+    if wrong:
         raise ValueError(
-            f"{where}: want numbers {', '.join(keys)} (OpenCV, pixels) and nothing else, see {wrong}"
+            f"{where}: want whole numbers {', '.join(sides)} and numbers {', '.join(others)} (OpenCV, pixels) and "
+            f"nothing else; wrong, missing or unknown: {', '.join(sorted(wrong))}"
         )
     try:
-        sides = int(got["width"]), int(got["height"])
-        return opencv_camera(*sides, *(float(got[key]) for key in keys[2:]))
+        return opencv_camera(*(int(got[key]) for key in sides), *(float(got[key]) for key in others))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 _log = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ class ClassMap:
         """Return the name of a class's object; None for a class that is left out."""
         return self._named.get(name, name)
 
-    @property
+    @cached_property
     def _named(self) -> dict[str, str | None]:
         """The mapping as text: numbers that the command line parsed (``{0: mug}``) are names, too."""
         return {str(key): None if name is None else str(name) for key, name in (self.mapping or {}).items()}
@@ -54,12 +55,12 @@ class ClassMap:
 
         Classes that are not objects are missing. Objects without a class give a warning.
         """
-        named = {name: self.object_of(name) for name in names}
+        named, place = {name: self.object_of(name) for name in names}, {o: i for i, o in enumerate(objects)}
         for lacking in sorted(set(objects) - set(named.values())):
             _log.warning("%s: no %s for object %s, which gets no score", self.source, self.kind[0], lacking)
         return {
-            name: None if found is None else list(objects).index(found)
-            for name, found in named.items() if found is None or found in objects
+            name: None if found is None else place[found]
+            for name, found in named.items() if found is None or found in place
         }  # fmt: skip
 
     def refuse(self, names: Collection[str], objects: Sequence[str]) -> None:

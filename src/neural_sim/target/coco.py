@@ -19,7 +19,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.pictures import read_header, refuse_mode
+from neural_sim.pictures import by, read_header, refuse_mode
 from neural_sim.ranges import validated
 from neural_sim.target.base import AnnotatedPhotographs
 from neural_sim.target.camera import camera_of_entry
@@ -47,9 +47,9 @@ class CocoTarget(AnnotatedPhotographs):
         images: folder to which its ``file_name`` entries are relative; None: the file's own folder.
         categories: category name -> object name, null to leave a category out. Names not listed are the names of their
             objects.
-        bin_attribute: attribute of the file's annotations, or else of their image, with the pose bin, counted from 1
-            like ``dominant`` of a distribution; dots lead into nested entries (``attributes.pose``). Boxes without it
-            have no bin. None: no box has one.
+        bin_attribute: attribute that holds the pose bin, counted from 1 as in ``dominant`` of a distribution. It is
+            read from the annotation or, if that lacks it, from the annotation's image; dots lead into nested entries
+            (``attributes.pose``). Boxes without it have no bin. None: no box has one.
         match_bins: in every part, choose photographs such that each object's bins follow the ``target`` of the first
             parameter with bins, see ``neural_sim.target.pose_bins.matching``. Needs photographs of a single object
             each.
@@ -57,9 +57,9 @@ class CocoTarget(AnnotatedPhotographs):
     See ``Photographs`` for the other arguments.
 
     Raises:
-        ValueError: there is no such file, it is not in COCO form, a number is out of its range, ``match_bins`` is set
-            without ``bin_attribute``, ``split_by`` does not give two or more groups, a category is not in the file, or
-            a bin is invalid or no entry has one.
+        ValueError: there is no such file, it is not in COCO form or has no usable box, a number is out of its range,
+            ``match_bins`` is set without ``bin_attribute``, ``split_by`` gives fewer than two groups, a category is not
+            in the file, or a bin is invalid or no entry has one.
     """
 
     annotations: str | Path
@@ -76,13 +76,17 @@ class CocoTarget(AnnotatedPhotographs):
             )
         if self.match_bins and self.bin_attribute is None:
             raise ValueError(
-                "target.match_bins: want target.bin_attribute, which says the pose bins, got null"
+                "target.match_bins: want target.bin_attribute, the attribute that holds the pose bin, got null"
             )
         if not self._entries:
-            raise ValueError(f"{self.source}: holds no images")
+            raise ValueError(f"{self.source}: has no images")
+        if not self._coco.usable:
+            raise ValueError(
+                f"{self.source}: has no usable box (crowds and boxes without a side do not count)"
+            )
         self._classes.check_listed(self._coco.category_names)
         self._coco.check_declared()
-        self._check_pictures()
+        self._coco.check_boxes(self._sizes)
         _ = self._groups, self._bins  # refused here rather than after the fields are fitted
 
     @property
@@ -162,8 +166,13 @@ class CocoTarget(AnnotatedPhotographs):
     def _where(self, entry: Entry) -> str:
         return f"{self._path(entry)} (named in {self.source})"
 
-    def _check_pictures(self) -> None:
-        """Raise ``ValueError`` for pictures whose headers cannot be read or show another size than listed."""
+    @cached_property
+    def _sizes(self) -> dict[Any, tuple[int, int]]:
+        """Width and height of the upright pictures, by image id.
+
+        Raises:
+            ValueError: a picture's header cannot be read, or shows another size than listed.
+        """
         unsized, moved, sizes = [], [], {}
         for entry in self._entries:
             path, where = self._path(entry), self._where(entry)
@@ -180,23 +189,24 @@ class CocoTarget(AnnotatedPhotographs):
                 moved.append(f"{path} for {entry['file_name']!r}")
             if header.orientation > 1 and listed_size(entry) is None:
                 unsized.append(path)
-        self._coco.check_boxes(sizes)
         if moved:
             _log.warning(
-                "%s: %d file names are found elsewhere, such as %s", self.source, len(moved), moved[0]
-            )
+                "%s: %d pictures are not where file_name says and were found elsewhere, such as %s",
+                self.source, len(moved), moved[0],
+            )  # fmt: skip
         if unsized:
             _log.warning(
-                "%s: %d photographs without width and height are turned by EXIF, such as %s; their boxes are taken to "
-                "be of the upright pictures", self.source, len(unsized), unsized[0],
+                "%s: %d photographs are turned by EXIF and listed without width and height, such as %s; their boxes "
+                "are taken to be in the upright pictures", self.source, len(unsized), unsized[0],
             )  # fmt: skip
+        return sizes
 
     @override
     def camera(self) -> PinholeCamera:
         """Return the camera of the file's entry ``camera``, see ``neural_sim.target.camera.camera_of_entry``.
 
         Raises:
-            ValueError: the file has no camera, or photographs are listed with another size.
+            ValueError: the file has no camera, or photographs have another size.
         """
         entry = self._coco.document.get("camera")
         if entry is None:
@@ -204,11 +214,13 @@ class CocoTarget(AnnotatedPhotographs):
                 f"{self.source}: camera=from_target needs an entry 'camera' with width, height, fx, fy, cx, cy"
             )
         camera = camera_of_entry(entry, f"{self.source}: camera")
-        size = {"width": camera.width, "height": camera.height}
+        size = camera.width, camera.height
         for image in self._entries:
-            other = {key: image[key] for key in size if image.get(key, size[key]) != size[key]}
-            if other:
-                raise ValueError(f"{self.source}: {image['file_name']} has {other}, its camera {size}")
+            shown = self._sizes[image["id"]]
+            if shown != size:
+                raise ValueError(
+                    f"{self.source}: {image['file_name']} has {by(shown)} pixels, its camera {by(size)}"
+                )
         return camera
 
     @override
@@ -220,8 +232,6 @@ class CocoTarget(AnnotatedPhotographs):
         self._coco.refuse_strange(self._classes, objects)
         labels = self._coco.by_id(self._classes.labels(names, objects))
         rows = self._coco.rows_by_image(labels)
-        if not self._coco.usable:
-            raise ValueError(f"{self.source}: holds no box of anything")
         self._log_left_out(names, objects)
         return [
             self._photograph(entry, group, rows.get(entry["id"], []), labels)
@@ -256,9 +266,11 @@ class CocoTarget(AnnotatedPhotographs):
 
     def _log_left_out(self, names: Sequence[str], objects: Sequence[str]) -> None:
         """Log the number of boxes of categories that are not objects, which ``unmatched=leave_out`` drops."""
-        strange = {name for name in names if self._classes.object_of(name) not in (None, *objects)}
+        classes = self._classes
+        strange = {name for name in names if classes.object_of(name) not in (None, *objects)}
         known = {entry["id"]: str(entry["name"]) for entry in self._coco.document["categories"]}
-        counts = Counter(known[item["category_id"]] for item in self._coco.annotations)
+        items = (self._coco.annotations[row] for row in self._coco.usable)
+        counts = Counter(known[item["category_id"]] for item in items if item["image_id"] in self._sizes)
         left_out = {name: counts[name] for name in sorted(strange) if counts[name]}
         if left_out:
             _log.info("%s: boxes of categories that are not objects left out: %s", self.source, left_out)

@@ -160,8 +160,8 @@ class CocoFile:
         counts = {
             "crowds are left out (iscrowd=1, which CVAT also writes for masks)": sum(map(is_crowd, upright)),
             "boxes without a width or a height are left out": sum(not has_size(item) for item in upright),
-            "boxes come twice and are left out once": len(file._repeated),
-            "boxes are turned (attributes.rotation); the upright ones about them are taken":
+            "boxes repeat an earlier one and are left out": len(file._repeated),
+            "boxes are rotated (attributes.rotation) and replaced by the upright boxes around them":
                 sum(a is not b for a, b in zip(upright, document["annotations"], strict=True)),
         }  # fmt: skip
         for what, count in counts.items():
@@ -174,8 +174,10 @@ class CocoFile:
         """Indices of annotations that repeat an earlier one."""
         seen, repeated = set(), set()
         for row, item in enumerate(self.annotations):
+            if is_crowd(item) or not has_size(item):
+                continue  # it is left out, so that a box like it is no repetition
             said = (item["image_id"], item["category_id"], tuple(item["bbox"]))
-            if said in seen and has_size(item) and not is_crowd(item):
+            if said in seen:
                 repeated.add(row)
             seen.add(said)
         return repeated
@@ -206,14 +208,13 @@ class CocoFile:
             )
         if ((boxes[:, 2:] <= 0.0) | (boxes[:, :2] >= limits)).any(-1).all():
             raise ValueError(f"{self.path}: no box lies on its picture, {example}: {wanted}")
-        corners = torch.cat(
-            [boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1
-        )  # what it would be if the numbers were corners
+        # The boxes if their four numbers were two corners:
+        corners = torch.cat([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1)
         fits = ((corners[:, 2:] > corners[:, :2]) & (corners[:, 2:] <= limits + 1.0)).all()
         if fits and 2 * int(beyond.sum()) > len(rows):
             raise ValueError(
-                f"{self.path}: {int(beyond.sum())} of {len(rows)} boxes reach beyond their pictures and none would as "
-                f"two corners, {example}: {wanted}"
+                f"{self.path}: {int(beyond.sum())} of {len(rows)} boxes reach beyond their pictures, but none would if "
+                f"its numbers were two corners, {example}: {wanted}"
             )
         if beyond.any():
             _log.warning(
@@ -222,14 +223,14 @@ class CocoFile:
             )  # fmt: skip
 
     def _check_unique(self, section: str, key: str, other: str) -> None:
-        """Raise ``ValueError`` for two entries with the same value of ``key``."""
+        """Raise ``ValueError`` for two entries with the same value of ``key``, or two spellings of one file's name."""
         first: dict[Any, int] = {}
         for number, entry in enumerate(self.document[section]):
-            before = first.setdefault(entry[key], number)
+            before = first.setdefault(name_of(entry) if key == "file_name" else entry[key], number)
             if before != number:
                 raise ValueError(
                     f"{self.path}: {section}[{before}] and [{number}] ({self.document[section][before][other]!r} and "
-                    f"{entry[other]!r}) have one {key}, {entry[key]!r}: whose annotations are whose is not known"
+                    f"{entry[other]!r}) have the same {key}, {entry[key]!r}: their annotations cannot be told apart"
                 )
 
     def check_declared(self) -> None:
@@ -304,7 +305,7 @@ class CocoFile:
 
     @cached_property
     def usable(self) -> list[int]:
-        """Indices of the annotations of single objects, without crowds, empty boxes and repetitions."""
+        """Indices of the annotations of single objects: no crowds, empty boxes or repetitions."""
         return [
             row for row, item in enumerate(self.annotations)
             if has_size(item) and not is_crowd(item) and row not in self._repeated

@@ -11,8 +11,8 @@ from neural_sim.documents import read_json
 _SUFFIXES = {
     ".yaml": "YOLO",
     ".yml": "YOLO",
-    ".xml": "Pascal VOC's or CVAT's",
-    ".csv": "a table's",
+    ".xml": "Pascal VOC or CVAT",
+    ".csv": "tabular",
 }
 _CONVERT = (
     "want COCO's JSON: export it as COCO, or convert it (supervision: DetectionDataset.from_yolo(...) or "
@@ -41,7 +41,7 @@ def missing_file(path: Path) -> str:
 
 
 def _of_another_kind(path: Path) -> str:
-    return f"{path} is of a data set in {_SUFFIXES[path.suffix.lower()]} format; {_CONVERT}"
+    return f"{path} belongs to a data set in {_SUFFIXES[path.suffix.lower()]} format; {_CONVERT}"
 
 
 def read_sections(path: Path, sections: Sequence[str]) -> Mapping[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -104,12 +105,12 @@ class Truth:
         by_last: dict[str, list[dict[str, Any]]] = {}
         for name, entry in by_name.items():
             by_last.setdefault(Path(name).name, []).append(entry)
-        last_names = [path.name for path in self.photos.paths]
+        last_names = Counter(path.name for path in self.photos.paths)
         found = {}
         for path in self.photos.paths:
             entry = by_name.get(self.photos.name(path)) or by_name.get(_below(path, self.path.parent))
             same = by_last.get(path.name, [])
-            if entry is None and len(same) == 1 and last_names.count(path.name) == 1:
+            if entry is None and len(same) == 1 and last_names[path.name] == 1:
                 entry = same[0]
             if entry is not None:
                 found[path] = entry
