@@ -1,5 +1,7 @@
 """What differs between image sets whose difference is known, and that equal sets do not differ."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -100,6 +102,17 @@ def test_several_objects_ask_for_as_many():
         ]
         == "[2,2]"
     )
+
+
+def test_an_image_is_not_asked_for_more_objects_than_there_are():
+    """Synthesised images show each object once, the target's may show one of them several times."""
+    two = scenes(40, 0, objects=2)
+    target, synthesised = replace(two, labels=two.labels.clamp_max(0)), scenes(40, 1)
+    found = matching_settings(target, synthesised, mismatches(target, synthesised))
+    assert found["synthesis.objects_per_image"] == "[1,1]"
+    empty = replace(two, labels=torch.full_like(two.labels, -1))
+    found = matching_settings(empty, synthesised, mismatches(empty, synthesised))
+    assert found["synthesis.objects_per_image"] == "[0,1]"
 
 
 def test_a_target_with_larger_boxes_asks_for_nearer_cameras():

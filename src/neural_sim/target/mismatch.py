@@ -17,7 +17,7 @@ from neural_sim.types import LabelledImages
 LEVEL = 0.01
 """Family-wise level over all statistics."""
 LARGE = 0.2
-"""Distance of the probability below from one half at which a significant difference counts."""
+"""Smallest distance of ``Mismatch.larger`` from one half at which a significant difference counts."""
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 _BLURS = 25
 
@@ -71,7 +71,8 @@ def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "_"]]:
 
 def mismatches(target: LabelledImages, synthesised: LabelledImages) -> list[Mismatch]:
     """Compare every statistic for which both sets have values."""
-    pairs = [(name, mine, statistics(synthesised)[name]) for name, mine in statistics(target).items()]
+    others = statistics(synthesised)
+    pairs = [(name, mine, others[name]) for name, mine in statistics(target).items()]
     pairs = [(name, mine, other) for name, mine, other in pairs if len(mine) and len(other)]
     found = []
     for name, mine, other in pairs:
@@ -134,8 +135,10 @@ def matching_settings(
         blur = _blur_to(mine["sharpness"].median(), synthesised, largest_blur, level)
         settings["synthesis.sensor.blur"] = f"[{blur:.2g},{blur:.2g}]"
     if "objects" in differs:
-        low, high = (int(mine["objects"].quantile(q)) for q in (0.05, 0.95))
-        settings["synthesis.objects_per_image"] = f"[{low},{high}]"
+        # Synthesised images show each class once at most.
+        most = max(1, 1 + int(max(images.labels.max() for images in (target, synthesised))))
+        low, high = (min(int(mine["objects"].quantile(q)), most) for q in (0.05, 0.95))
+        settings["synthesis.objects_per_image"] = f"[{low},{max(high, 1)}]"
     return settings
 
 
@@ -153,7 +156,8 @@ def distance_factor(found: list[Mismatch]) -> float | None:
 def _blur_to(wanted: Tensor, synthesised: LabelledImages, largest: float, level: float) -> float:
     """Find the blur, on a grid up to ``largest``, at which the synthesised images' median sharpness is ``wanted``.
 
-    Noise of the target's ``level``, which adds to the differences between pixels, is added after each blur.
+    Noise of the standard deviation ``level`` is added after each blur, because it adds to the differences between
+    pixels in the target as well.
     """
     deviations, images = torch.linspace(0.0, largest, _BLURS), synthesised.images
     grain = level * torch.randn(images.shape, generator=torch.Generator().manual_seed(0)).to(images)

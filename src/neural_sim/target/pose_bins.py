@@ -18,7 +18,7 @@ from neural_sim.types import LabelledImages, SceneDraw
 
 TURN = 2.0 * math.pi
 SAME = 1e-6
-"""Tolerance in radians when two names of one viewpoint are compared by how far they lie outside the ranges."""
+"""Difference in radians up to which two names of one viewpoint lie equally far outside the ranges."""
 Range = tuple[float, float]
 
 
@@ -61,7 +61,7 @@ def viewpoint_of(
         rho_range: range of the second angle, in radians.
 
     Raises:
-        ValueError: a camera is at the object's centre, or has that centre exactly behind it.
+        ValueError: a camera is at the object's centre, or faces exactly away from it.
     """
     pose = object_to_camera.double()
     turn, offset = pose[:, :3, :3], pose[:, :3, 3]
@@ -73,7 +73,7 @@ def viewpoint_of(
     toward = -torch.einsum("nij,ni->nj", turn, offset) / distance.clamp_min(1e-300)[:, None]
     if not bool((distance > 0.0).all() and ((backward * toward).sum(-1) > -1.0 + 1e-12).all()):
         raise ValueError(
-            "viewpoint: want cameras that stand off the object's centre and do not turn their back to it"
+            "want a camera away from the object's centre that does not face exactly away from it"
         )
     right = _turned(right, backward, toward)
     theta = torch.atan2(toward[:, :2].norm(dim=-1), toward[:, 2])
@@ -164,7 +164,7 @@ def matching(
         ValueError: a photograph shows several objects or bins, or none shows a bin that the distribution needs; the
             message begins with ``where``.
     """
-    cells = _rows_by_cell(images, rows, where)
+    cells = _rows_by_cell(images, rows, tuple(targets), where)
     chosen: list[int] = []
     for label, (name, p) in enumerate(targets.items()):
         own = [cells.get((label, b), []) for b in range(len(p))]
@@ -174,7 +174,8 @@ def matching(
         if counts is None:
             lacking = [b for b, each in enumerate(own, 1) if not each]
             raise ValueError(
-                f"{where}: want {name} in bins as {[round(v, 3) for v in p.tolist()]}, none in {lacking}"
+                f"{where}: want {name} in the bins with p = {[round(v, 3) for v in p.tolist()]}, but no photograph "
+                f"shows it in bins {lacking}"
             )
         for each, count in zip(own, counts, strict=True):
             order = torch.randperm(len(each), generator=generator)[:count].tolist()
@@ -185,7 +186,7 @@ def matching(
 
 
 def _rows_by_cell(
-    images: LabelledImages, rows: Int[Tensor, "part"], where: str
+    images: LabelledImages, rows: Int[Tensor, "part"], names: Sequence[str], where: str
 ) -> dict[tuple[int, int], list[int]]:
     """Return the rows that show an object in a bin, by its label and the bin."""
     cells: dict[tuple[int, int], list[int]] = {}
@@ -193,9 +194,8 @@ def _rows_by_cell(
         labels, bins = images.labels[row].tolist(), _bins(images, row)
         seen = {(label, b) for label, b in zip(labels, bins, strict=True) if label >= 0}
         if len(seen) > 1:
-            raise ValueError(
-                f"{where}: want photographs of one object in one bin each, got one of {sorted(seen)}"
-            )
+            shown = ", ".join(f"{names[label]} in bin {b + 1 or 'unknown'}" for label, b in sorted(seen))
+            raise ValueError(f"{where}: want photographs of one object in one bin each, got one of {shown}")
         for label, b in seen:
             if b >= 0:
                 cells.setdefault((label, b), []).append(row)
