@@ -46,7 +46,10 @@ def test_every_method_is_scored_alike(experiment):
 
 def test_all_seeds_of_a_method_are_runs_of_the_same_settings():
     first = of("+experiment=pose_gap")
-    for override in ("seed=4", "score_at=[1,3]", "progress=false", "paths.store=elsewhere", "trainer=gpu"):
+    for override in (
+        "seed=4", "score_at=[1,3]", "progress=false", "paths.store=elsewhere", "trainer=gpu", "model.onnx=true",
+        "viewer.port=1",
+    ):  # fmt: skip
         other = of("+experiment=pose_gap", override)
         assert (other["scoring"], other["configuration"]) == (first["scoring"], first["configuration"])
 
@@ -57,6 +60,7 @@ def test_all_seeds_of_a_method_are_runs_of_the_same_settings():
         "scale=smoke", "views.count=99", "field=mlp", "renderer.rays_per_chunk=4096", "+synthesis.background.grain=0.5",
         "unlearned.distance=[2,3]", "target.test_per_object=99", "detector=micro", "training.cold_epochs=29",
         "gap=uniform", "parameter.pose.biased.drill.target=uniform", "parameter=[pose,zoom]", "parameter.pose.bins=4",
+        "camera.field_of_view_deg=50",
     ],
 )  # fmt: skip
 def test_what_ap_depends_on_is_not_compared_across(override):

@@ -102,6 +102,14 @@ def test_a_ratio_to_what_is_not_told_from_nothing_has_no_interval():
     assert math.isnan(ratio((gap, gap + STILL), (nothing, nothing + STILL)).value)
 
 
+def test_where_almost_no_draw_shows_a_box_there_is_no_interval():
+    """No bounds, rather than bounds that are not numbers."""
+    values, bare = np.array([0.5, 0.75]), np.array([[0.5, 0.75], [np.nan, np.nan]])
+    assert over_seeds_and_images(values, bare) == Estimate(0.625)
+    assert over_seeds_and_images(values[:1], bare[1:, :1]) == Estimate(0.5)
+    assert ratio((values, bare), (np.array([0.5, 1.0]), bare)) == Estimate(pytest.approx(0.625 / 0.75))
+
+
 def test_all_that_is_gained_of_a_gap_is_certain_though_the_gap_varies():
     gap = np.array([0.2, 0.3, 0.4])
     found = ratio((gap, around(gap, 0.01)), (gap, around(gap, 0.01)))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 import torch
@@ -120,7 +121,7 @@ def test_a_panel_without_a_target_has_no_bar():
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
     trust = (
-        "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; rejected after training on them 2 of 2; "
+        "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; trainings rejected 2 of the 2 that they judged; "
         "taken back at the end b (keeps 1 of 3 steps); "
     )
     trust += "cosine with the response of training 0.90, 0.90"
@@ -212,7 +213,10 @@ def test_the_strip_shows_each_object_before_and_after_with_its_score(results):
     ]  # the biased object first
     words = [text.get_text() for text in axes.texts]
     assert words[:3] == ["the target", "rendered at first", "rendered now"]
-    assert words[3].startswith("b: AP\n") and " before\n" in words[3] and " after" in words[3]
+    assert words[3:] == [
+        "b: not in the\ntest images",
+        "a: AP\n60 before\n60 after\n60 if the target were known",
+    ]
 
 
 def live(uri, results):
@@ -279,7 +283,8 @@ def test_iterations_and_stages_are_there_when_they_end_and_are_written_once(resu
 
 
 def test_what_was_reached_charts_by_what_was_spent(results, uri, tmp_path):
-    scores = {"ap": 0.5, "per_class": {"a": 0.6, "b": 0.4}}
+    results = dataclasses.replace(results, biased=("a", "b"))
+    scores = {"ap": 0.5, "per_class": {"a": 0.6, "b": math.nan}}  # no test image shows b
     points = [
         {"iteration": i, "images": 300 * i, "seconds": 2.6 * i, "ap": scores | {"ap": 0.1 * i}}
         for i in (0, 4)
@@ -322,6 +327,14 @@ def test_a_sweep_ends_with_what_its_runs_scored_by_what_was_swept(tmp_path):
         "| 2 | no results |  |  | 10_seed=2 |",
     ]
     assert lines[-1] == f"pages: {tmp_path}/<folder>/report.html"
+
+
+def test_a_sweep_leaves_empty_what_no_test_image_shows(tmp_path):
+    for name in ("0", "1"):
+        job(tmp_path, name, [f"seed={name}"], 0.5)
+        held = json.loads((tmp_path / name / "results.json").read_text())
+        (tmp_path / name / "results.json").write_text(json.dumps({**held, "biased": ["can"]}))
+    assert sweep_table(tmp_path).splitlines()[2] == "| 0 |  |  |  | 0 |"
 
 
 def test_a_sweep_of_trials_says_so_and_one_result_is_no_table(tmp_path):

@@ -126,6 +126,12 @@ def test_a_class_without_boxes_is_in_no_mean():
     assert made.shown == ["can"] and made.mean("ns") == made.of_classes(["can"]).mean("ns")
 
 
+def test_a_class_has_the_mean_of_the_seeds_that_show_it():
+    rows = {"ns": [[outcomes(0.5), outcomes(0.25, shown=False)], [outcomes(0.75), outcomes(0.25)]]}
+    found = ScoreTable.of(rows, ("can", "mug"), 5).by_class("ns")
+    assert found == pytest.approx({"can": 0.625, "mug": 0.25}, abs=0.01)
+
+
 def test_scatter_is_a_standard_deviation_between_seeds_and_over_images():
     made = table(200, ns=[(0.4, 0.4), (0.6, 0.6)], learned=[(0.5, 0.5), (0.5, 0.5)])
     (low, high), found = made.sample("ns")[0], made.scatter()

@@ -9,17 +9,30 @@ from mlflow.exceptions import MlflowException
 
 from neural_sim.interruption import this_process
 from neural_sim.report import tracking
+from neural_sim.report.database import database_of
 
 
 def opened(uri, **more):
     return tracking.opened(uri, "gap", "ours seed 0", {"seed": "0"}, {"outer.iterations": 3}, **more)
 
 
-def test_tracking_uri_keeps_uris_and_makes_paths_absolute(tmp_path):
+def test_tracking_uri_keeps_uris_and_makes_paths_absolute(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert tracking.tracking_uri("~/mlflow.db") == f"sqlite:///{tmp_path.resolve()}/mlflow.db"
     assert tracking.tracking_uri("http://localhost:5000") == "http://localhost:5000"
     assert tracking.tracking_uri("outputs/mlflow.db").startswith("sqlite:////")
     with pytest.raises(ValueError, match=r"paths\.mlflow"):
         tracking.tracking_uri("")
+
+
+def test_a_relative_sqlite_uri_is_a_file_in_the_working_directory(uri, monkeypatch):
+    """Twice: a new database and one that exists; files of runs need an absolute address."""
+    database = database_of(uri)
+    monkeypatch.chdir(database.parent)
+    for count in (1, 2):
+        with opened(f"sqlite:///{database.name}"):
+            pass
+        assert len(tracking.logged_runs(uri, "gap")) == count
 
 
 def test_a_run_is_there_while_it_goes_on_and_has_its_duration(uri):
@@ -86,7 +99,7 @@ def test_what_the_store_refuses_for_now_is_written_later(uri, caplog):
         for step in range(2):
             run.log({"psi/loss": float(step)}, step)
         assert not reader.get_metric_history(run.run_id, "psi/loss")
-        assert caplog.text.count("metrics wait for the next writing (the store is away)") == 2
+        assert caplog.text.count("its metrics are kept for the next write (the store is away)") == 2
         run.log({"psi/loss": 2.0}, 2)
         assert len(reader.get_metric_history(run.run_id, "psi/loss")) == 3
     with opened(uri) as run:  # what never gets through costs the numbers there, not the results and the exit
@@ -128,6 +141,8 @@ def test_the_address_of_a_run_and_of_a_table(uri):
     assert command == f"mlflow ui --backend-store-uri {uri}"
     found = MlflowClient(uri).get_experiment_by_name("gap").experiment_id
     base = f"http://127.0.0.1:5000/#/experiments/{found}/runs"
+    spaced = tracking.where("sqlite:////my runs/mlflow.db", "3").splitlines()[0]
+    assert spaced == "mlflow ui --backend-store-uri 'sqlite:////my runs/mlflow.db'"
     assert address == f"{base}/{run.run_id}?workflowType=machine_learning"
     assert tracking.where_runs(uri, "gap").endswith(f"\n{base}?workflowType=machine_learning")
     assert tracking.where("https://host:80/", "3", "ab") == (

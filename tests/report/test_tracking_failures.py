@@ -27,15 +27,15 @@ def test_a_full_disk_at_the_end_is_a_warning(uri, tmp_path, monkeypatch, caplog)
         monkeypatch.setattr(run._client, "log_artifacts", full)
         monkeypatch.setattr(run._client, "set_terminated", full)
         run.log_files(tmp_path)
-    assert "not all of" in caplog.text and "No space left on device" in caplog.text
-    assert "stays open, want FINISHED" in caplog.text
+    assert "not all files of" in caplog.text and "No space left on device" in caplog.text
+    assert "it stays open instead of FINISHED" in caplog.text
 
 
 def test_a_database_that_is_damaged_while_a_run_is_open_is_a_warning(uri, tmp_path, caplog):
     with caplog.at_level(logging.WARNING), opened(uri) as run:
         (tmp_path / "mlflow.db").write_bytes(b"SQLite format 3\0" + bytes(8192))
         run.log({"a": 1.0})
-    assert "metrics wait" in caplog.text and "stays open, want FINISHED" in caplog.text
+    assert "metrics are kept" in caplog.text and "it stays open instead of FINISHED" in caplog.text
 
 
 @pytest.mark.parametrize("keep", [17, 5000])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +69,12 @@ def of_document(document: Mapping[str, Any]) -> TestScore:
 def mean_of(document: Mapping[str, Any]) -> float:
     """Return the mean over classes from a score's dictionary (see ``of_document``)."""
     return document["ap"] if "ap" in document else document["accuracy"]
+
+
+def mean_over(document: Mapping[str, Any], names: Iterable[str]) -> float:
+    """Return the mean of a score's dictionary over those of the named classes that have a score; nan if none has."""
+    scores = (document["per_class"][name] for name in names)
+    return _mean([value for value in scores if value is not None])  # JSON has null for nan
 
 
 def evaluate(

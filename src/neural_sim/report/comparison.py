@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from neural_sim.detector.metrics import mean_over
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import markdown_table
 from neural_sim.report.intervals import Estimate, over_seeds
@@ -21,8 +22,9 @@ from neural_sim.report.tracking import UNKNOWN
 BUDGETS = 6
 """Number of times at which the methods are compared, evenly spaced in log seconds."""
 ONLY_AT_END = (
-    "Some runs were scored at their end alone and count as their start until then, so that areas, and scores and leads "
-    "after fewer seconds, do not tell who is ahead: score_at=[0.25,0.5] scores a run on its way, too."
+    "Some runs were scored only at their end and keep the score of their start until then, so that areas, and scores "
+    "and leads after fewer seconds, do not tell who is ahead. With score_at=[0.25,0.5], a run is also scored on its "
+    "way."
 )
 SPENT = ("images", "detector_steps", "products")
 Clock = Literal["seconds", "cpu_seconds"]
@@ -33,8 +35,8 @@ Clock = Literal["seconds", "cpu_seconds"]
 class Comparison:
     """A comparison of the methods of one setting, over the seeds that all of them have.
 
-    Scores are means over the biased objects. If some run was scored only at its end (``only_at_end``), values at fewer
-    seconds than a run took do not show which method leads.
+    Scores are means over the biased objects. If some run was scored only at its end (``only_at_end``), scores and leads
+    before the end do not show which method is ahead.
 
     Args:
         setting: the experiment and its gap.
@@ -47,9 +49,10 @@ class Comparison:
         ahead: the reference's score minus each other method's.
         area: the same difference for the areas under the score against log seconds, per unit of log seconds.
         spent: the total cost of every method, including the warm start, means over seeds.
-        at_equal_cost: the score after as many seconds as the cheapest method took in total, see ``ap_at``.
+        at_equal_cost: the score after the total seconds of the cheapest method, see ``ap_at``.
         equal_cost: these seconds, averaged over seeds.
-        budgets: seconds from the first scored iteration of any run to the last.
+        budgets: times at which the methods are compared, in seconds: from the first scored iteration of any run to the
+            last.
         ahead_at: the reference's lead over each other method at each of ``budgets``; a method that has ended by then
             keeps its last score.
         clock: how seconds are measured.
@@ -140,9 +143,9 @@ Curve = tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"]]
 
 
 def biased_ap(run: FinishedRun, clock: Clock) -> Curve:
-    """Return the curve of the biased objects' mean score over time."""
+    """Return the curve over time of the mean score of the biased objects that the test images show."""
     curve, biased = run.results["curve"], run.results["biased"]
-    ap = [_mean(point["ap"]["per_class"][name] for name in biased) for point in curve]
+    ap = [mean_over(point["ap"], biased) for point in curve]
     return np.asarray([point[clock] for point in curve]), np.asarray(ap)
 
 
@@ -229,6 +232,7 @@ def _mean(values: Iterable[float]) -> float:
 # --- costs ---
 
 PHASES: Mapping[str, tuple[str, ...]] = {
+    "first step": ("first_step",),
     "images": ("pool", "probes", "render", "features"),
     "training": ("train",),
     "derivative": ("hypergradient",),
@@ -239,9 +243,9 @@ SECONDS = ("warm start", *PHASES, "in all")
 HEAD = (*(f"{column}, s" for column in SECONDS), "MB", "images", "error of the gradient")
 """Headings of the columns of ``cells``."""
 NOTE = (
-    "Seconds on the wall, of the warm start and of the psi loop by phase. MB: the most that the process of a run had "
-    "in memory. Images: those rendered for both. Error of the gradient: its standard error over images relative to "
-    "its length, median over iterations and objects."
+    "Wall-clock seconds of the warm start and of each phase of the psi loop; the first step is the reading of the "
+    "target's boxes. MB: peak memory of a run's process. Images: those rendered for the warm start and the loop. Error "
+    "of the gradient: its standard error over images relative to its length, median over iterations and objects."
 )
 
 
@@ -291,7 +295,11 @@ def _seconds(run: Mapping[str, Any]) -> dict[str, float]:
     }
     total = run["curve"][-1]["seconds"]
     # A result from the store is charged with the seconds that it took to make, not with those of this run's stage.
-    return {"warm start": max(total - sum(loop.values()), 0.0), **loop, "in all": total}
+    before = max(total - sum(loop.values()), 0.0)
+    if run.get("shown") and not run["iterations"]:
+        # The method is a reading of the target's boxes, and trains no detector.
+        before, loop["first step"] = 0.0, before
+    return {"warm start": before, **loop, "in all": total}
 
 
 def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
@@ -305,8 +313,9 @@ def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
         if "gradient_errors" in record
         for pair in zip(record["gradient_errors"], record["gradient_norms"], strict=True)
     ]
+    known = [pair for pair in pairs if None not in pair]  # JSON has null for what is not finite
     return [
-        error / norm for error, norm in pairs if norm > 0.0 and error > 0.0 and math.isfinite(error / norm)
+        error / norm for error, norm in known if norm > 0.0 and error > 0.0 and math.isfinite(error / norm)
     ]
 
 
@@ -314,7 +323,8 @@ def costs_table(runs: Sequence[FinishedRun]) -> str:
     """Return a Markdown table with one row per method."""
     table = markdown_table(["cost", *HEAD], [[method, *cells(cost)] for method, cost in costs(runs).items()])
     commits = sorted({run.results.get("commit") or UNKNOWN for run in runs})
-    return f"{table}\n\nOf {len(runs)} run{'s' * (len(runs) > 1)}, commit {', '.join(commits)}. {NOTE}"
+    made = f"{len(runs)} run{'s' * (len(runs) > 1)}, commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
+    return f"{table}\n\n{made}. {NOTE}"
 
 
 def cells(cost: Costs) -> list[str]:

@@ -17,8 +17,8 @@ _PATIENCE = 60.0
 
 
 def database_of(uri: str) -> Path | None:
-    """Return the file of a SQLite store, None for others."""
-    return Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
+    """Return the absolute path of a SQLite store's file, None for other stores."""
+    return Path(uri.removeprefix("sqlite:///")).absolute() if uri.startswith("sqlite:///") else None
 
 
 def guard(uri: str) -> AbstractContextManager[Any]:

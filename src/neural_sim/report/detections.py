@@ -71,7 +71,7 @@ def read_detections(file: Path) -> tuple[LabelledImages, dict[str, list[Detectio
     """Read detections.json: the test set without pixels, and the detections of every detector.
 
     Raises:
-        ValueError: a file that is no JSON or holds something else, with its path.
+        ValueError: the file is not JSON or holds something else; the message has its path.
     """
     stored = read_json(file)
     try:
@@ -172,7 +172,7 @@ def scores_table(scores: TestScore, images: int) -> str:
     else:
         name, columns, means = "accuracy", {"accuracy": scores.per_class}, [scores.accuracy]
     lines = [f"{f'{name} on {images} pictures':<28}" + "".join(f"{column:>8}" for column in columns)]
-    rows = {of: [column[of] for column in columns.values()] for of in scores.per_class} | {"mean": means}
-    for of, row in rows.items():
+    rows = [(of, [column[of] for column in columns.values()]) for of in scores.per_class]
+    for of, row in [*rows, ("mean", means)]:
         lines.append(f"{of[:27]:<28}" + "".join(f"{100 * value:>8.1f}" for value in row))
     return "\n".join(lines)

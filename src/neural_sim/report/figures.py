@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -123,7 +124,7 @@ def shown_panel(axes: Any, one: FactorEstimate) -> None:
                  label="target", alpha=strong)  # fmt: skip
     style(axes)
     axes.set_xticks(at, ["=".join(map(str, group)) for group in groups], fontsize=7)
-    axes.set(ylim=(min(0.0, float(low.min())), 1))
+    axes.set(ylim=(min(0.0, float(low.min())), max(1.0, float(high.max())) if one.lights else 1))
     axes.legend(fontsize=7, frameon=False)
 
 
@@ -251,6 +252,8 @@ def _gained(results: RunResults, name: str) -> str:
         for which in ("ns", "learned", "matched")
         if which in results.ap
     }
+    if any(math.isnan(value) for value in values.values()):
+        return f"{name}: not in the\ntest images"
     return "\n".join([f"{name}: {results.score}", *(f"{value:.0f} {said}" for said, value in values.items())])
 
 

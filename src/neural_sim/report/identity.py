@@ -12,13 +12,16 @@ from neural_sim.types import LabelledImages
 
 KEYS = ("scoring", "configuration", "test_set")
 """Digests in results.json, see ``identity``."""
-SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "detector", "training")
-"""Groups of the configuration that a detector's AP depends on, whichever method chose its training distribution."""
+SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "camera", "detector", "training")
+"""Groups of the configuration on which a detector's AP depends, whichever method chose its training distribution."""
 METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint")
 """Keys of ``parameter.*`` and ``synthesis`` that say how a method draws, steps and differentiates; the others define
 the initial distribution and the target's."""
-RUN_KEYS = ("seed", "score_at", "stages", "progress", "resume", "workers", "worker_gpus", "paths", "trainer")
-"""Keys by which runs of the same settings may differ."""
+RUN_KEYS = (
+    "seed", "score_at", "stages", "progress", "resume", "workers", "worker_gpus", "paths", "trainer", "model",
+    "preflight", "repeat", "predict", "export", "box", "viewer", "doctor",
+)  # fmt: skip
+"""Keys that may differ between runs of the same settings: how a run is executed, and what else is made of it."""
 SHOWN = 3
 """Number of differences that are named; the others are counted."""
 
@@ -67,7 +70,8 @@ def at_scale(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
 def scored_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that scores depend on, whatever the method; objects are identified by their contents."""
     parameters = {name: _without_choices(node) for name, node in config["parameter"].items()}
-    return {**{group: _without_choices(config[group]) for group in SCORED}, "parameter": parameters}
+    groups = (group for group in SCORED if group in config)  # older runs lack some
+    return {**{group: _without_choices(config[group]) for group in groups}, "parameter": parameters}
 
 
 def _without_choices(node: Mapping[str, Any]) -> dict[str, Any]:

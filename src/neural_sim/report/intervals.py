@@ -70,11 +70,11 @@ def bounds(estimate: Estimate) -> str:
     """Write an interval in points: ``20.1 to 27.3``."""
     if estimate.low is None or estimate.high is None:
         return "no interval"
-    return f"{100.0 * estimate.low:.1f} to {100.0 * estimate.high:.1f}"
+    return f"{_hundredfold(estimate.low, 1)} to {_hundredfold(estimate.high, 1)}"
 
 
 def _hundredfold(value: float, digits: int) -> str:
-    """Write a value in hundredths, never as a negative zero."""
+    """Write a fraction in points, never as a negative zero."""
     return f"{100 * value:z.{digits}f}"
 
 
@@ -97,12 +97,17 @@ def over_seeds_and_images(
     if len(values) == 1:
         return over_images(float(values[0]), resampled[:, 0])
     value = float(np.mean(values))
-    half = math.sqrt(max(_covariance((values, resampled), (values, resampled)), 0.0))
+    square = _covariance((values, resampled), (values, resampled))
+    if math.isnan(square):
+        return Estimate(value)
+    half = math.sqrt(max(square, 0.0))
     return Estimate(value, value - half, value + half)
 
 
 def over_images(value: float, resampled: Float[np.ndarray, "draws"]) -> Estimate:
     """Return a value with the 2.5 % and 97.5 % quantiles of its resampled values, ignoring nan."""
+    if np.isnan(resampled).all():
+        return Estimate(value)
     low, high = np.nanquantile(resampled, [0.025, 0.975])
     return Estimate(value, float(low), float(high))
 
@@ -121,7 +126,7 @@ def ratio(numerator: Sample, denominator: Sample) -> Estimate:
     nn, nd = (_covariance(numerator, other) for other in (numerator, denominator))
     dd = _covariance(denominator, denominator)
     square = d * d - dd
-    if square <= 0.0:
+    if not square > 0.0:
         return Estimate(value)
     # (n - r d)^2 <= nn - 2 r nd + r^2 dd, with two roots if the coefficient of r^2 is positive.
     root = math.sqrt(max((n * d - nd) ** 2 - square * (n * n - nn), 0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +14,7 @@ import yaml
 from torch import Tensor
 
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
-from neural_sim.detector.metrics import mean_of
+from neural_sim.detector.metrics import mean_of, mean_over
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import finite, markdown_table, plain_table, read_json, write_json
 from neural_sim.outer.certificate import untrusted
@@ -28,7 +29,7 @@ CALLED = {
     "real_only": "photographs alone",
     "views_only": "the fields' views alone",
 }
-"""Names of detectors for readers, by their names in files, which say what they were trained on."""
+"""What readers are told of the training images of each detector, by its name in files."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ class RunResults:
         lines += [f"{self.score} on {self.made.shows}", self._score_table()]
         if self.real:
             lines.append(
-                "trained on {photographs} photographs too (training.real.mode={mode})".format(**self.real)
+                "also trained on {photographs} photographs (training.real.mode={mode})".format(**self.real)
             )
         if self.validation_ap is not None:
             score = f"{100 * self.validation_ap:.1f}"
@@ -253,9 +254,9 @@ def _trust_line(trust: Mapping[str, Any]) -> str:
         if trust[part]:
             text += "; " + ", ".join(f"{name} {count}" for name, count in trust[part].items())
     if trust["waited"]:
-        text += f"; of the others, {trust['waited']} waited (little gain, or a spent trust radius)"
+        text += f"; of the trusted, {trust['waited']} waited (little gain, or a spent trust radius)"
     if trust["judged"]:
-        text += f"; rejected after training on them {trust['rejected']} of {trust['judged']}"
+        text += f"; trainings rejected {trust['rejected']} of the {trust['judged']} that they judged"
     if trust["taken_back"]:
         backs = (
             f"{name} (keeps {b['kept']} of {b['accepted']} steps)" for name, b in trust["taken_back"].items()
@@ -295,9 +296,7 @@ def sweep_table(folder: Path) -> str:
     ]
     head = [*swept, *(f"{score} {CALLED[which]}" for which in SCORED), "folder"]
     notes = [said for scale in {own.get("scale", "") for own in results.values()} if (said := caution(scale))]
-    about = (
-        f"{score} in points, the mean of the objects that start away from the target; of all where none does."
-    )
+    about = f"{score} in points: the mean over the objects that start away from the target, or over all if none does."
     return "\n\n".join([*notes, markdown_table(head, rows), about, f"pages: {folder}/<folder>/report.html"])
 
 
@@ -318,8 +317,6 @@ def _scores(results: Mapping[str, Any] | None) -> list[str]:
     cells = []
     for which in SCORED:
         scores = results["ap"].get(which)
-        own = [scores["per_class"][name] for name in results["biased"]] if scores else []
-        known = [value for value in own if value is not None]
-        mean = sum(known) / len(known) if known else mean_of(scores) if scores else None
-        cells.append("" if mean is None else f"{100 * mean:.1f}")
+        mean = mean_over(scores, results["biased"] or scores["per_class"]) if scores else math.nan
+        cells.append("" if math.isnan(mean) else f"{100 * mean:.1f}")
     return cells

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from neural_sim.detector.metrics import mean_of
+from neural_sim.detector.metrics import mean_of, mean_over
 from neural_sim.report import tracking
 from neural_sim.report.model_files import log_detector
 from neural_sim.report.run import RunResults
@@ -170,10 +170,7 @@ def _curve(results: RunResults) -> dict[str, dict[int, float]]:
     for point in results.curve:
         scores = {_key(results): mean_of(point["ap"])}
         if results.biased:
-            per_class = point["ap"]["per_class"]
-            scores[f"biased_{_key(results)}"] = sum(per_class[name] for name in results.biased) / len(
-                results.biased
-            )
+            scores[f"biased_{_key(results)}"] = mean_over(point["ap"], results.biased)
         for by, (what, value) in itertools.product(("iteration", "images", "seconds"), scores.items()):
             series.setdefault(f"curve/{what}_by_{by}", {})[round(point[by])] = value
     return series

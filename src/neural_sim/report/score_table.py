@@ -233,8 +233,8 @@ class ScoreTable:
         return ratio(_minus(self.sample(detector), start_of), _minus(goal_of, start_of))
 
     def by_class(self, detector: str) -> dict[str, float]:
-        """Return a detector's score of every class, the mean over seeds."""
-        means = self.point[self.detectors.index(detector)].mean(0)
+        """Return a detector's score of every class, the mean over the seeds whose test images show it."""
+        means = mean_of_known(self.point[self.detectors.index(detector)].T)
         return dict(zip(self.classes, means.tolist(), strict=True))
 
     def scatter(self) -> Scatter:

@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import re
+import shlex
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,11 +23,11 @@ from neural_sim.report.provenance import commit
 _log = logging.getLogger(__name__)
 
 KIND = ("mlflow.experimentKind", "custom_model_development")
-"""The tag by which versions of MLflow that go by tags show an experiment as model training."""
+"""The tag that makes MLflow show an experiment as model training, in the versions that read it."""
 TRAINING = "workflowType=machine_learning"
 """URL query that opens MLflow's view of training; newer versions default to GenAI and would show an empty page."""
 COMMIT = "mlflow.source.git.commit"
-"""The tag from which MLflow shows the commit of a run's code, or ``UNKNOWN``."""
+"""The tag, shown by MLflow, that holds the commit of a run's code, or ``UNKNOWN``."""
 UNKNOWN = "unknown"
 SOURCE = {"source": "neural-sim"}
 """The tag of every run that this program opens."""
@@ -46,7 +47,7 @@ def tracking_uri(location: str) -> str:
         raise ValueError("paths.mlflow is empty: want a file such as outputs/mlflow.db or a tracking URI")
     if "://" in location or location == "databricks":
         return location
-    return f"sqlite:///{Path(location).resolve()}"
+    return f"sqlite:///{Path(location).expanduser().resolve()}"
 
 
 def where(uri: str, experiment_id: str, run_id: str | None = None) -> str:
@@ -56,7 +57,7 @@ def where(uri: str, experiment_id: str, run_id: str | None = None) -> str:
         return uri.rstrip("/") + path
     if uri.startswith("databricks"):
         return f"{uri}: experiment {experiment_id}" + (f", run {run_id}" if run_id else "")
-    return f"mlflow ui --backend-store-uri {uri}\nhttp://127.0.0.1:5000{path}"
+    return f"mlflow ui --backend-store-uri {shlex.quote(uri)}\nhttp://127.0.0.1:5000{path}"
 
 
 class Run:
@@ -89,7 +90,7 @@ class Run:
             steps = values.items() if isinstance(values, Mapping) else enumerate(values)
             finite = [(step, float(v)) for step, v in steps if math.isfinite(v)]
             self._waiting += [Metric(_allowed(key), v, now, step) for step, v in finite]
-        self._try("metrics wait for the next writing", self._send)
+        self._try("its metrics are kept for the next write", self._send)
 
     def tag(self, key: str, text: str) -> None:
         """Set a tag of the run."""
@@ -98,7 +99,7 @@ class Run:
     def log_files(self, folder: Path) -> None:
         """Copy a folder to the run's artifacts."""
         self._try(
-            f"not all of {folder} is among its artifacts",
+            f"not all files of {folder} are among its artifacts",
             lambda: self._client.log_artifacts(self.run_id, str(folder)),
         )
 
@@ -129,7 +130,7 @@ class Run:
         self._try("the last metrics are lost", self._send)
         if error is not None:
             self.tag("error", f"{type(error).__name__}: {error}".splitlines()[0][:500])
-        self._try(f"the run stays open, want {status}", lambda: self._end(status))
+        self._try(f"it stays open instead of {status}", lambda: self._end(status))
 
     def parameters(self, parameters: Mapping[str, Any]) -> None:
         """Write the configuration."""
@@ -216,7 +217,7 @@ def opened(
 
 
 def close_abandoned(client: Any) -> list[str]:
-    """End the runs of this machine's processes that were killed outright and could not end them themselves.
+    """End the runs that processes of this machine left open when they were killed.
 
     Returns:
         The ids of the runs, which are now KILLED; the log names each.
@@ -383,12 +384,10 @@ def where_runs(uri: str, experiment: str) -> str:
 def _logged(client: Any, run: Any) -> LoggedRun:
     info = run.info
     files = frozenset(item.path for item in client.list_artifacts(info.run_id))
-
-    def fetch(name: str) -> Path:
-        return Path(client.download_artifacts(info.run_id, name))
-
-    commit = run.data.tags.get(COMMIT, UNKNOWN)
-    return LoggedRun(info.run_id, info.run_name, info.status, commit, run.data.params, files, fetch)
+    return LoggedRun(
+        info.run_id, info.run_name, info.status, run.data.tags.get(COMMIT, UNKNOWN), run.data.params, files,
+        lambda name: Path(client.download_artifacts(info.run_id, name)),
+    )  # fmt: skip
 
 
 def _known_id(client: Any, uri: str, experiment: str) -> str:

@@ -272,7 +272,7 @@ def _leads(c: Comparison) -> list[str]:
     """Return a table of the reference's lead by budget, with a note; nothing if there is no other method."""
     if not c.ahead_at:
         return []
-    head = [f"{c.reference} ahead after so many {_unit(c)}, of", *(f"{budget:.0f}" for budget in c.budgets)]
+    head = [f"{c.reference} ahead after ({_unit(c)}), of", *(f"{budget:.0f}" for budget in c.budgets)]
     rows = [[method, *(points(lead, sure=c.timed) for lead in leads)] for method, leads in c.ahead_at.items()]
     note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."
     return [markdown_table(head, rows), note]

@@ -99,7 +99,7 @@ def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, 
         "Scores", "What was learned", "What is still weak", "Training images", "Detections on test images",
         "How far to trust it", "What it cost", "Next",
     ]  # fmt: skip
-    assert "In one training of each, the learned distribution gave" in page and "more on mug" in page
+    assert "With one training on each distribution, the learned one gave" in page and "more on mug" in page
     assert "<code>stages=[repeat]</code> trains them again" in page
     assert re.findall(r'href="([^"]*)"', page) == ["results.json"]
     assert all(source.startswith("data:image/") for source in re.findall(r'src="([^"]*)"', page))
@@ -133,10 +133,7 @@ def test_a_page_says_that_photographs_have_an_unknown_distribution(results, show
         .read_text()
     )
     text = re.sub(r'src="[^"]*"|<style>.*?</style>', "", page, flags=re.DOTALL)
-    assert (
-        "the learned distribution gave" in text
-        and "The target's is not known: its images are photographs." in text
-    )
+    assert "the learned one gave" in text and "The target's is not known: its images are photographs." in text
     assert not re.search("if the target were known|distance|the target's own", text)
 
 
@@ -168,6 +165,19 @@ def test_a_class_that_the_test_set_lacks_has_no_verdict(results, shown, tmp_path
     one = dataclasses.replace(shown.test, labels=torch.zeros_like(shown.test.labels))
     page = RunPage(results, dataclasses.replace(shown, test=one)).write({}, tmp_path).read_text()
     assert "The other objects" not in page and "on mug" in page
+
+
+def test_a_test_set_without_a_box_has_no_verdict_either(results, shown, tmp_path):
+    nothing = dataclasses.replace(shown.test, labels=torch.full_like(shown.test.labels, -1))
+    page = RunPage(results, dataclasses.replace(shown, test=nothing)).write({}, tmp_path).read_text()
+    assert "whether it worked is not known" in page
+
+
+def test_a_curve_is_of_the_objects_that_test_images_show():
+    scores = {"ap": 0.5, "per_class": {"mug": 0.5, "can": float("nan")}}
+    points = [{"seconds": at, "ap": scores} for at in (0.0, 5.0, 10.0)]
+    drawn = [run_page.curve_chart(points, names, {}) for names in (["mug"], ["mug", "can"])]
+    assert drawn[0] == drawn[1]
 
 
 @pytest.mark.slow
@@ -216,7 +226,7 @@ def test_every_bin_is_pictured_with_its_share_and_its_score(results, shown, tmp_
     assert "bin 1 25 → 85 % (85) AP 38 → 100" in text and "bin 2 25 → 5 % (5) AP 0 → 38" in text
     assert "bin 1 (looks like 3)" in text
     assert re.search(
-        r"mug from bin 2 : about 30\.9 AP of this object to win\. AP 38 on 6 test images, 50 %", text
+        r"mug from bin 2 : about 30\.9 AP of this object could be gained\. AP 38 on 6 test images, 50 %", text
     )
     assert "bin 1 has 100; training on the target&#39;s own distribution reaches 100 here" in text
 

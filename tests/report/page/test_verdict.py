@@ -44,7 +44,10 @@ def test_a_gain_is_the_difference_of_ap_and_its_fraction_of_the_room():
     text = verdict(better, trainings=2)
     assert text.startswith("It worked") and "on mug" in text and f"{better.closed:.0%}" in text
     one = verdict(better)
-    assert one.startswith("In one training of each, the learned distribution gave") and "more on mug" in one
+    assert (
+        one.startswith("With one training on each distribution, the learned one gave")
+        and "more on mug" in one
+    )
     assert f"({bounds(better.gain)} over test images), from" in one and f"{better.closed:.0%}" in one
 
 
@@ -67,7 +70,7 @@ def test_a_loss_is_called_one():
     lost, least, most = (-100 * value for value in (worse.gain.value, worse.gain.high, worse.gain.low))
     several, one = verdict(worse, trainings=2), verdict(worse)
     assert f"costs {lost:.1f} AP on mug ({least:.1f} to {most:.1f})." in several and 0 < least < most
-    assert one.startswith("In one training of each") and "worse" not in one
+    assert one.startswith("With one training on each distribution") and "worse" not in one
     assert f"gave {lost:.1f} AP less on mug ({least:.1f} to {most:.1f} over test images)." in one
 
 
@@ -85,4 +88,5 @@ def test_without_a_gap_the_target_is_not_mentioned():
 
 def test_lists_and_intervals_read_as_sentences_do():
     assert [listed(["a"]), listed(["a", "b"]), listed(["a", "b", "c"])] == ["a", "a and b", "a, b and c"]
+    assert bounds(Estimate(0.1, -0.0001, 0.152)) == "0.0 to 15.2"
     assert bounds(Estimate(0.1, 0.05, 0.152)) == "5.0 to 15.2" and bounds(Estimate(0.1)) == "no interval"

@@ -179,7 +179,7 @@ def test_a_page_keeps_settings_without_runs_here_beside_those_with(page, tmp_pat
     assert "| 100.0" in newer and newer not in first
     assert newer.split(" | ")[5] == "", "LTS of an older commit does not stand beside it"
     assert any("gap, can: NSO 75.2" in row and "(commit 1234567, 7654321) |" in row for row in second)
-    assert any(row.startswith("Of 1 run, commit 7654321.") for row in second)
+    assert any(row.startswith("1 run, commit 7654321.") for row in second)
 
 
 def test_our_scores_stand_beside_those_of_the_papers_table():

@@ -158,7 +158,10 @@ _UNJUDGED: Mapping[str, Kind] = {
     "waited": "waited",
     "skipped": "skipped",
 }
-"""The kind of a step that was not judged, by the certificate's actions; the first that any factor has is shown."""
+"""The kind of a step that no training judged, by the certificate's action.
+
+If an object's factors differ, the first of their actions in this order is shown.
+"""
 
 
 @dataclass(frozen=True)

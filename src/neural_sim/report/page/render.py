@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,9 @@ _pages = Environment(
 )
 
 
-def whole(value: float) -> str:
-    """Write a fraction in whole points."""
-    return f"{100.0 * value:z.0f}"
-
-
-def percent(value: float | None) -> str:
-    """Write a fraction in points with one decimal; a dash for no value."""
-    return "–" if value is None or value != value else f"{100.0 * value:.1f}"
+def percent(value: float | None, digits: int = 1) -> str:
+    """Write a fraction in points; a dash for no value."""
+    return "–" if value is None or value != value else f"{100.0 * value:z.{digits}f}"
 
 
 def capital(text: str) -> str:
@@ -36,7 +32,7 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-_pages.filters |= {"percent": percent, "whole": whole, "capital": capital}
+_pages.filters |= {"percent": percent, "whole": partial(percent, digits=0), "capital": capital}
 
 
 def page(template: str, **values: Any) -> str:

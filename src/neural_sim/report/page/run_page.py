@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neural_sim.detector.metrics import mean_of
+from neural_sim.detector.metrics import mean_of, mean_over
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import write_whole
 from neural_sim.outer.certificate import untrusted
@@ -88,12 +88,17 @@ class RunPage:
 
     @cached_property
     def gains(self) -> dict[str, Gain]:
-        """Gains of the objects that the run is about, of all others, and of each other object that certainly lost."""
+        """Gains of the objects that the run is about, of all others, and of each other object that lost significantly.
+
+        Empty if there are no scores.
+        """
         results = self.results
         if not self.shown.detections:
             return {}
         same = results.target_known and all(one.p["initial"] == one.p["target"] for one in results.learned)
         table = score_table(self.shown, results.names, results.score)
+        if not table.shown:
+            return {}
 
         def gain(names: Sequence[str]) -> Gain:
             return Gain.of(table.of_classes(names), same)
@@ -196,8 +201,7 @@ def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
         return None
     bounds = {}
     if "matched" in results.ap:
-        per_class = results.ap["matched"]["per_class"]
-        bounds = {CALLED["matched"]: sum(per_class[name] for name in aim) / len(aim)}
+        bounds = {CALLED["matched"]: mean_over(results.ap["matched"], aim)}
     return curve_chart(results.curve, list(aim), bounds, results.score)
 
 
@@ -211,14 +215,14 @@ def curve_chart(
 
     Args:
         curve: costs and scores (as fractions) of the scored iterations.
-        names: names of the classes.
+        names: names of the classes; those without a score are left out of the mean.
         bounds: scores of other detectors by name, drawn as lines.
         score: the kind of score.
     """
     figure = Figure(figsize=(6.2, 2.9), layout="constrained")
     axes = figure.add_subplot()
     seconds = [point["seconds"] for point in curve]
-    ap = [100.0 * sum(point["ap"]["per_class"][name] for name in names) / len(names) for point in curve]
+    ap = [100.0 * mean_over(point["ap"], names) for point in curve]
     axes.plot(seconds, ap, "o-", color=figures.METHOD_COLOURS["learned"], linewidth=1.6, markersize=5)
     for place in _apart(seconds):
         axes.annotate(f"{ap[place]:.1f}", (seconds[place], ap[place]), textcoords="offset points", xytext=(0, 6),

@@ -82,7 +82,7 @@ def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1, images: 
     points, reach, who = PERCENT * gain.gain.value, bounds(gain.gain), listed(gain.names)
     change = f"{abs(points):.1f} {POINTS[score]}"
     reached = f"{PERCENT * gain.ap['ns']:.1f} to {PERCENT * gain.ap['learned']:.1f}"
-    one = "In one training of each, the learned distribution gave"
+    one = "With one training on each distribution, the learned one gave"
     if gain.outcome == "better":
         several = "It worked: training on the learned distribution gives"
         text = f"{several if trainings > 1 else one} {change} more on {who}"
@@ -95,7 +95,7 @@ def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1, images: 
         return (
             f"It made things worse: training on the learned distribution costs {change} on {who} ({reach})."
         )
-    changes = f"changes the {score} of {who} by {points:+.1f}"
+    changes = f"changes the {score} of {who} by {points:+z.1f}"
     text = f"No difference can be told on {images}: the learned distribution {changes} ({reach})"
     return f"{text}{_of_the_room(gain)}."
 
@@ -104,5 +104,5 @@ def _of_the_room(gain: Gain) -> str:
     if gain.room is None:
         return ""
     if gain.closed is None:
-        return f"; the target's own distribution would give {PERCENT * gain.room.value:+.1f} ({bounds(gain.room)})"
+        return f"; the target's own distribution would give {PERCENT * gain.room.value:+z.1f} ({bounds(gain.room)})"
     return f", {gain.closed:.0%} of what the target's own distribution would give"
