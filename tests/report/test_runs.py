@@ -46,7 +46,7 @@ def test_a_later_smoke_run_replaces_no_real_one():
     assert chosen(group) == [("ours", 0, "1"), ("lts", 0, "2")]
     assert (group.setting, group.label, group.heading, group.seeds) == ("pose_gap", "pose_gap", "", (0,))
     assert reasons(left_out) == {
-        "9": "no run of ours is scored in the same way; beside ours seed 0 (00000001), views.size is 0, not 1; "
+        "9": "no run of ours is scored in the same way; compared with ours seed 0 (00000001), views.size is 0, not 1; "
         "training.size is 0, not 1"
     }
 
@@ -82,7 +82,7 @@ def test_a_methods_runs_share_the_settings_of_the_newest():
         ("lts", 1, "4"),
     ]
     assert reasons(left_out)["2"].startswith(
-        "not run as the newest of lts, lts seed 1 (00000004): baseline.learning_rate is 2, not absent"
+        "its settings are not those of the newest run of lts, lts seed 1 (00000004): baseline.learning_rate is 2"
     )
 
 
@@ -90,7 +90,7 @@ def test_of_equal_runs_the_newest_counts():
     groups, left_out = selected([made("ours", 0, 2), made("ours", 0, 1)], "ours")
     assert chosen(groups[0]) == [("ours", 0, "2")]
     assert reasons(left_out) == {
-        "1": "a newer run of the same settings and seed stands for it, ours seed 0 (00000002)"
+        "1": "a newer run of the same settings and seed replaces it, ours seed 0 (00000002)"
     }
 
 
@@ -140,7 +140,7 @@ def test_a_method_of_one_seed_takes_no_seeds_from_those_that_are_named():
     [
         (FinishedRun(name="x", run_id="9x", unusable="its status in MLflow is FAILED"), "status in MLflow is FAILED"),
         (made("lts", 0, 9, scoring=None), "an older version wrote it"),
-        (made("lts", 0, 9, biased=[]), "none of its objects starts from another distribution"),
+        (made("lts", 0, 9, biased=[]), "all its objects start from the target"),
         (made("oracle", 0, 9), "rows ns and matched"),
     ],
 )  # fmt: skip

@@ -127,7 +127,7 @@ def test_a_report_has_rows_of_real_only_synthetic_only_and_both(folder, capsys):
     printed = capsys.readouterr().out
     (means,) = (line.split() for line in printed.splitlines() if line.startswith("mean"))
     assert len(means) == 1 + len(ROWS)
-    assert "trained on 5 photographs too (training.real.mode=combined)" in printed
+    assert "also trained on 5 photographs (training.real.mode=combined)" in printed
     targets, graph = context.results(context.graph.targets), context.graph
     parts = [targets.train, targets.val, targets.test]
     pixels = [{image.numpy().tobytes() for image in part.images} for part in parts]

@@ -91,7 +91,7 @@ class BoxPage:
         )
         gui, frames = self.server.gui, self.capture.frames
         gui.add_markdown(
-            "Drag the two corners until the box holds the object and nothing else, in several photographs."
+            "Drag the two corners until the box holds the object and nothing else. Check it in several photographs."
         )
         self.number = gui.add_slider("photograph", 1, max(len(frames), 2), 1, 1)
         self.image = gui.add_image(drawn(frames[0], self.box))

@@ -61,7 +61,7 @@ class ModelFiles:
 
     def __post_init__(self) -> None:
         if self.nms and not self.onnx:
-            raise ValueError("model.nms needs model.onnx=true, which it is a part of")
+            raise ValueError("model.nms needs model.onnx=true: suppression is written into model.onnx")
         if self.registered_name is not None and not (self.pyfunc and self.registered_name):
             raise ValueError(
                 f"model.registered_name needs model.pyfunc=true and a name, got {self.registered_name!r}"

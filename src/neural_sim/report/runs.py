@@ -22,11 +22,11 @@ from neural_sim.report.score_table import Outcomes, ScoreTable, match
 
 BOUNDS = ("ns", "matched")
 """Detectors that every run has, whatever its method: trained on the initial distribution and, if known, on the
-target's. They represent the methods in ``FIXED``, whose own runs are not compared again."""
+target's. They stand for the methods in ``FIXED``, whose own runs are not compared."""
 FIXED = ("ns", "oracle")
 WITHOUT = ("synthetic_only", "real_only", "views_only")
-"""Detectors that are also scored if training uses photographs: trained on synthetic images alone, on photographs alone,
-and on the views of the fields alone."""
+"""Detectors that are scored as well if training uses photographs: trained on synthetic images alone, on photographs
+alone, and on the views of the fields alone."""
 RESULTS = "results.json"
 
 Key = TypeVar("Key", bound=Hashable)
@@ -286,11 +286,11 @@ def _why_unusable(run: FinishedRun, reference: str, methods: Sequence[str] | Non
     if methods is not None and run.method not in (reference, *methods):
         return "compare.methods does not name its method"
     if not all(run.results.get(key) for key in KEYS):
-        return "an older version wrote it, without the digests that say what it can be compared with"
+        return "an older version wrote it, without the digests that tell what it can be compared with"
     if not (run.results["biased"] and run.results["curve"]):
-        return "none of its objects starts from another distribution than its target's"
+        return "all its objects start from the target's distribution"
     if run.method in FIXED and run.method != reference:
-        return "every run trains and scores this detector itself: rows ns and matched"
+        return "every run trains and scores this detector itself, see the rows ns and matched"
     return None
 
 
@@ -302,7 +302,7 @@ def _why_no_reference(run: FinishedRun, reference: str, anchors: Sequence[Finish
     if not anchors:
         return f"{reference} has no run of this setting"
     differs = differences(scored_values(run.results), scored_values(anchors[0].results))
-    return f"no run of {reference} is scored in the same way; beside {anchors[0].label}, {differs}"
+    return f"no run of {reference} is scored in the same way; compared with {anchors[0].label}, {differs}"
 
 
 def _comparable(runs: Runs, reference: str) -> Runs:
@@ -331,7 +331,7 @@ def _of_one_configuration(runs: Runs) -> Runs:
         if run.results["configuration"] == newest.results["configuration"]:
             return None
         differs = differences(all_values(run.results), all_values(newest.results))
-        return f"not run as the newest of {run.method}, {newest.label}: {differs}"
+        return f"its settings are not those of the newest run of {run.method}, {newest.label}: {differs}"
 
     return runs.without(reason)
 
@@ -342,7 +342,7 @@ def _newest_of_seeds(runs: Runs) -> Runs:
     def reason(run: FinishedRun) -> str | None:
         if newest[run.seed] is run:
             return None
-        return f"a newer run of the same settings and seed stands for it, {newest[run.seed].label}"
+        return f"a newer run of the same settings and seed replaces it, {newest[run.seed].label}"
 
     return runs.without(reason)
 

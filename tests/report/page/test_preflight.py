@@ -56,7 +56,7 @@ def test_what_the_target_shows_is_worth_a_run_where_the_first_step_goes_there():
     hopeless = dataclasses.replace(preflight(0.5), shown=estimates)
     assert hopeless.verdict.startswith("Not worth optimising")
     follows = dataclasses.replace(hopeless, follows=True)
-    assert follows.verdict.startswith("Worth a run: your target shows drill and can otherwise than")
+    assert follows.verdict.startswith("Worth a run: your target shows drill and can differently from")
     assert follows.verdict.endswith("derivatives alone would move nothing.")
     both = dataclasses.replace(preflight(0.001), shown=estimates, follows=True)
     assert both.verdict.endswith("derivatives would move object 0.")
@@ -74,7 +74,7 @@ def test_the_summary_has_gains_weak_bins_and_advice():
 
 def test_the_gain_is_told_in_labelled_photographs():
     report = preflight(0.001, 0.5)
-    assert report.gain == 0.1 and "none are for training" in report.worth
+    assert report.gain == 0.1 and "none are set aside for training" in report.worth
     counted = dataclasses.replace(
         report, labelled=(PhotographGain(10, 0.05, 0.01), PhotographGain(25, 0.2, None))
     )
@@ -83,7 +83,7 @@ def test_the_gain_is_told_in_labelled_photographs():
     few = dataclasses.replace(report, labelled=(PhotographGain(10, 0.05, 0.01),))
     assert few.worth.startswith("A first step is worth more than 10 of them.")
     hopeless = dataclasses.replace(preflight(0.5), labelled=few.labelled)
-    assert hopeless.worth.startswith("Labelled photographs in training")
+    assert hopeless.worth.startswith("Labelled photographs, added to")
 
 
 def test_the_page_is_self_contained(tmp_path):
@@ -92,7 +92,31 @@ def test_the_page_is_self_contained(tmp_path):
     )
     page = write_preflight_page(preflight(0.001, 0.5), images, images, tmp_path, {}).read_text()
     assert "Worth optimising: object 0" in page and "Box size differs" in page
+    assert page.count('<th class="cell">') == 2
     assert all(source.startswith("data:image/") for source in re.findall(r'src="([^"]*)"', page))
+
+
+def test_the_table_of_gains_has_a_heading_for_each_bin_of_any_factor(tmp_path):
+    images = LabelledImages(
+        torch.rand(1, 3, 24, 24), torch.zeros(1, 1, 4), torch.full((1, 1), -1), torch.zeros(1).long()
+    )
+    zoom = ExpectedGains("object 0", "zoom", 0.5, 0.15, (0.1,) * 5, (0.01,) * 5, 0.1, 0.02)
+    report = dataclasses.replace(preflight(0.001), foreseen=(foreseen("object 0", 0.001), zoom))
+    assert (
+        write_preflight_page(report, images, images, tmp_path, {}).read_text().count('<th class="cell">') == 5
+    )
+
+
+def test_lights_are_not_said_to_be_read_right(tmp_path):
+    """Their accuracy is a fraction of variance, which may be negative."""
+    images = LabelledImages(
+        torch.rand(1, 3, 24, 24), torch.zeros(1, 1, 4), torch.full((1, 1), -1), torch.zeros(1).long()
+    )
+    light = FactorEstimate("object 0", "illumination", 30, (0.5, 0.5), (0.9, 0.1), (0.8, 0.0), (1.2, 0.2),
+                           ((1,), (2,)), 0.01, 0.5, -0.1, "not told apart", lights=True)  # fmt: skip
+    report = dataclasses.replace(preflight(0.001), shown=(light,))
+    page = write_preflight_page(report, images, images, tmp_path, {}).read_text()
+    assert "0 % of the variance of guesses on held-out renders explained" in page and "read right" not in page
 
 
 def test_what_the_target_shows_is_said_and_drawn(tmp_path):

@@ -23,7 +23,7 @@ SHORTEST = 192
 OVERLAP = 0.5
 """Intersection over union from which a detection counts as right on the pages."""
 SHOWN = 0.3
-"""Score from which a detection on an image without objects is shown and counts."""
+"""Smallest score of a detection that is shown, and counts as wrong, on an image without objects."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,10 @@ def detected(
     detections: Sequence[Mapping[str, Tensor]],
     names: Sequence[str],
 ) -> list[Picture]:
-    """Return images with their best detections, as many as there are objects, over thin white ground-truth boxes."""
+    """Return images with their best detections over thin white ground-truth boxes.
+
+    There are as many detections as objects; on an image without objects, those that score ``SHOWN`` or more.
+    """
     pictures = []
     for row in rows:
         truth = images.boxes[row][images.labels[row] >= 0]
@@ -66,7 +69,7 @@ def right(detections: Mapping[str, Tensor], boxes: Tensor, labels: Tensor, score
     """Return whether an image's best detections, as many as it has objects, match these objects.
 
     Each must have the right class and an overlap of at least ``OVERLAP``; for accuracy, the right class is enough. An
-    image without objects is right if no detection scores ``SHOWN``.
+    image without objects is right if no detection scores ``SHOWN`` or more.
     """
     best = _best(detections, len(boxes))
     if not len(boxes):

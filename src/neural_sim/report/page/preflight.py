@@ -1,4 +1,4 @@
-"""preflight.html, which says whether an optimisation is worthwhile, judging by what is known beforehand."""
+"""preflight.html, which says whether an optimisation is worthwhile, by what is known before it."""
 
 from __future__ import annotations
 
@@ -90,8 +90,8 @@ class Preflight:
                 f"derivatives would move {listed(names)}" if names else "derivatives alone would move nothing"
             )
             return (
-                f"Worth a run: your target shows {listed(self.moved)} otherwise than they are rendered now. The first "
-                f"step goes there, and stays if a training is better for it; {derivatives}."
+                f"Worth a run: your target shows {listed(self.moved)} differently from how they are rendered now. The "
+                f"first step goes there, and is kept if training on it scores better; {derivatives}."
             )
         if not names:
             return (
@@ -110,17 +110,17 @@ class Preflight:
 
     @property
     def worth(self) -> str:
-        """A sentence that gives the equivalent of the gain in labelled photographs."""
+        """What the gain equals in labelled photographs, in one or two sentences."""
         if not self.labelled:
             return (
-                "What that equals in labelled photographs is not known: none are for training "
+                "How many labelled photographs a first step is worth is not known: none are set aside for training "
                 "(target.train_fraction, or target.train_per_object of rendered targets)."
             )
         tried = "; ".join(
             f"{g.photographs} lower it by {g.fall:.3f}" + ("" if g.error is None else f" ± {g.error:.3f}")
             for g in self.labelled
         )
-        sentence = f"Labelled photographs in training, beside the initial distribution's images: {tried}."
+        sentence = f"Labelled photographs, added to training images of the initial distribution: {tried}."
         if not self.promising:
             return sentence
         count = equivalent(self.labelled, self.gain)
@@ -149,7 +149,7 @@ class Preflight:
         for m in self.differing:
             lines.append(f"differs: {m.name}, target {m.target:.3g}, synthesised {m.synthesised:.3g}")
         for advice in self.advice:
-            lines.append(f"would match: {advice}")
+            lines.append(f"would reduce the difference: {advice}")
         return "\n".join(lines)
 
     @property
@@ -194,6 +194,7 @@ def write_preflight_page(
     path = folder / FILE
     text = render.page(
         "preflight.html", title=f"{report.experiment}: preflight", report=report, sides=sides, largest=largest,
+        columns=max(len(one.by_bin) for one in report.foreseen),
         shown=[(shown_chart(one), one) for one in report.shown],
         bins=by_object(report.bins), promising=report.promising, thumbnails=thumbnails,
     )  # fmt: skip
