@@ -218,9 +218,9 @@ def test_experiments_set_no_key_that_a_scale_sets():
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_scale_goes_with_labelled_photographs(scale, tmp_path):
     annotations = tmp_path / "val.json"
-    annotations.write_text(
-        json.dumps({"images": [{"id": 1, "file_name": "a.png"}], "categories": [], "annotations": []})
-    )
+    box = {"image_id": 1, "category_id": 1, "bbox": [2, 2, 4, 4]}
+    document = {"images": [{"id": 1, "file_name": "a.png"}], "categories": [{"id": 1, "name": "mug"}]}
+    annotations.write_text(json.dumps({**document, "annotations": [box]}))
     Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     made = build(_config("target=coco", f"target.annotations={annotations}", f"scale={scale}"))
     assert made.imaging.target.annotations == str(annotations)

@@ -119,7 +119,9 @@ def test_the_target_s_distribution_is_known_where_it_is_rendered_or_stated(
     labels = tmp_path / "labels.json"
     Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     entry = {"id": 1, "file_name": "a.png", "height": 8, "width": 8}
-    labels.write_text(json.dumps({"images": [entry], "annotations": [], "categories": []}))
+    document = {"images": [entry], "categories": [{"id": 1, "name": "mug"}]}
+    box = {"image_id": 1, "category_id": 1, "bbox": [2, 2, 4, 4]}
+    labels.write_text(json.dumps({**document, "annotations": [box]}))
     photographs = ["target=coco", f"target.annotations={labels}"] if target == "coco" else []
     words = ["scale=smoke", *photographs, *overrides, f"paths.store={tmp_path}"]
     graph = Graph(build(composed(*words)))

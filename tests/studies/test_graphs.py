@@ -145,8 +145,8 @@ def _labels(folder):
     path = folder / "labels.json"
     document = {
         "images": [{"id": i, "file_name": f"{i}.png"} for i in range(2)],
-        "annotations": [],
-        "categories": [],
+        "annotations": [{"image_id": 0, "category_id": 1, "bbox": [2, 2, 4, 4]}],
+        "categories": [{"id": 1, "name": "mug"}],
     }
     path.write_text(json.dumps(document))
     for image in document["images"]:
