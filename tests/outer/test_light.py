@@ -16,7 +16,7 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.gradient.implicit import Implicit
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.gradient.unrolled import Accumulated, Unrolled
 from neural_sim.outer.derivative import bound_losses, image_losses, object_images
 from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import learn_psi
@@ -121,12 +121,12 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
     psi = torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.6, 0.3]], dtype=DOUBLE)
     rendered = scene.training_set(psi, 3, generator)
     probed = ProbeSet.draw(scene, detector, backbone, 4, psi, generator, range(2))
-    cached = CachedSet.of(detector, backbone, rendered.images)
-    losses = bound_losses(cached, backbone, probed.cached)
+    each = torch.arange(len(probed.cached.inputs[0]))
+    exact = scores(probed.cached.losses, trainable, vector, each)
+    sums = Accumulated(exact.new_zeros(0), (), exact, len(exact))
     held = object_images(scene, rendered, psi, torch.full((6,), 1.0 / 6, dtype=DOUBLE))
-    estimator = StratifiedEstimator(4, theta_mode="forward")
     for label, name in enumerate(scene.names):
-        found = estimator.estimate(losses, trainable, vector, held[name], probed.probes[label])
+        found = StratifiedEstimator(4).accumulated(sums, held[name], probed.probes[label])
         index = probed.probes[label]["illumination"].index
 
         def mixed(weights, index=index):

@@ -134,9 +134,7 @@ def test_the_stratified_derivative_is_that_of_enumeration(several, counts):
         images, draw = scene.probes(label, "pose", per_bin, PSI, generator)
         probes = {"pose": Probes(torch.arange(len(images)), draw.bins[:, 0])}
         losses = Losses(lossy(score(rendered.images.images)), lambda *_: None, lossy(score(images.images)))
-        found = StratifiedEstimator(per_bin, theta_mode="forward").estimate(
-            losses, ONE, ONE, held[name], probes
-        )
+        found = StratifiedEstimator(per_bin).estimate(losses, ONE, ONE, held[name], probes)
         weighed = found.value * 0.5 * share / OBJECTS / held[name].weights.sum()
         assert float((weighed - expected[label]).norm()) < 4.0 * float(found.standard_error.norm())
         assert float(found.standard_error.norm()) < 0.1 * float(expected.norm())

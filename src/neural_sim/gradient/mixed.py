@@ -17,7 +17,7 @@ from neural_sim.gradient.base import ImageLoss, IndexedLoss, Params
 from neural_sim.solver.hvp import difference_length
 from neural_sim.solver.operator import flatten
 
-ThetaMode = Literal["forward", "central_difference"]
+Mode = Literal["forward", "central_difference"]
 LossesOf = Callable[[Params], Tensor]
 """Losses of fixed images as a function of the parameters."""
 
@@ -28,7 +28,7 @@ def scores(
     vector: Params,
     index: Int[Tensor, "n"],
     chunk_size: int = 32,
-    mode: ThetaMode = "forward",
+    mode: Mode = "forward",
 ) -> Float[Tensor, "n"]:
     """Compute ``s_i = <dl_i/dtheta, v>`` of the images in ``index``, with ``chunk_size`` of them in memory at a time.
 
@@ -113,7 +113,7 @@ def _device(params: Params) -> torch.device:
 
 
 def _check(mode: str, chunk_size: int) -> None:
-    if mode not in get_args(ThetaMode):
-        raise ValueError(f"gradient: mode must be one of {get_args(ThetaMode)}, got {mode!r}")
+    if mode not in get_args(Mode):
+        raise ValueError(f"gradient: mode must be one of {get_args(Mode)}, got {mode!r}")
     if chunk_size < 1:
         raise ValueError(f"gradient: chunk_size must be at least 1, got {chunk_size}")
