@@ -19,7 +19,7 @@ from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping
 
 PROXIMAL = 20.0  # past the negative curvature of an untrained detector
-NOTHING_WILL_DO = Implicit(curvature_images=6, max_stationarity=0.0)
+NOTHING_WILL_DO = Implicit(curvature_images=6, max_residual=0.0)
 
 
 @pytest.mark.parametrize("action", ["skip", "shrink", "keep"])
@@ -30,7 +30,7 @@ def test_untrusted_steps_are_skipped_shrunk_or_kept(scene, action):
             scene, estimator, 2, detector=MICRO, adjoint=NOTHING_WILL_DO, trust=Trust(on_untrusted=action)
         )
     )
-    assert all(record.certificate.doubts == ["stationarity"] for record in learned.records)
+    assert all(record.certificate.doubts == ["residual"] for record in learned.records)
     assert len(learned.records) == 2
     if action == "skip":
         assert not learned.last.any()
@@ -90,7 +90,7 @@ def test_a_step_is_certified_by_the_response_without_changing_the_run(scene, est
 
 
 def test_the_proximal_problem_runs_in_the_loop(scene):
-    solver = AdjointSolver(ConjugateGradient(), FixedDamping(0.0), sensitivity=True)
+    solver = AdjointSolver(ConjugateGradient(), FixedDamping(0.0))
     module = small_loop(
         scene,
         StratifiedEstimator(probes_per_bin=2),
@@ -101,4 +101,4 @@ def test_the_proximal_problem_runs_in_the_loop(scene):
     )
     certificate = learn_psi(module).records[0].certificate
     adjoint = certificate.adjoint
-    assert adjoint.solver_status == "CONVERGED" and adjoint.damping == 0.0 and adjoint.sensitivity == 0.0
+    assert adjoint.solver_status == "CONVERGED" and adjoint.damping == 0.0

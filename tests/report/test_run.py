@@ -30,7 +30,7 @@ def results():
         "certificate": {
             "adjoint": {
                 "stationarity": 1.0, "solver_status": "CONVERGED", "solver_steps": 3, "solver_residual": 0.01,
-                "damping": 2.0, "curvature_min": -1.0, "curvature_max": 9.0, "condition": 11.0, "sensitivity": None,
+                "damping": 2.0, "curvature_min": -1.0, "curvature_max": 9.0, "condition": 11.0,
             },
             "cosine": 0.9, "doubts": [],
             "p_values": {"a": {"pose": 0.3}, "b": {"pose": 0.01}},

@@ -26,9 +26,6 @@ class ImplicitAdjoint:
         damping_raises: number of increases of lambda after solves that met negative curvature.
         stationarity: ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
         validation_norm: ``|dL_val/dtheta|``.
-        sensitivity: ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` for the psi gradients g of all objects joined; None
-            if the solver was not asked for it, or g is zero. It does not measure a bias: if H is indefinite, g has
-            poles as a function of lambda.
     """
 
     solution: Solution
@@ -36,7 +33,6 @@ class ImplicitAdjoint:
     damping_raises: int
     stationarity: float
     validation_norm: float
-    sensitivity: float | None = None
 
     @property
     def products(self) -> int:

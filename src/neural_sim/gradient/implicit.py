@@ -33,32 +33,20 @@ class Implicit:
 
     Args:
         curvature_images: number of training images in the Hessian products; 0: all.
-        max_residual: largest trusted relative residual of the solve. None, here and below: no limit.
-        max_stationarity: largest trusted ``|dL_train/dtheta|``.
-        max_sensitivity: largest trusted relative change from lambda to 2 lambda; needs ``solver.sensitivity``.
+        max_residual: largest trusted relative residual of the solve; None: no limit.
     """
 
     curvature_images: NonNegativeInt = 64
     max_residual: NonNegative | None = 0.1
-    max_stationarity: NonNegative | None = None
-    max_sensitivity: NonNegative | None = None
 
     def doubts(self, adjoint: ImplicitAdjoint) -> list[str]:
         """Name the conditions that a solve fails."""
         solution = adjoint.solution
+        failed = ["solver"] if solution.status in FAILED else []
         # solver=identity never iterates: whoever chooses it accepts its residual.
-        residual = None if solution.status is Status.APPROXIMATE else solution.residual
-        limits = {
-            "residual": (residual, self.max_residual),
-            "stationarity": (adjoint.stationarity, self.max_stationarity),
-            "sensitivity": (adjoint.sensitivity, self.max_sensitivity),
-        }
-        failed = [
-            name
-            for name, (value, limit) in limits.items()
-            if value is not None and limit is not None and value > limit
-        ]
-        return (["solver"] if solution.status in FAILED else []) + failed
+        if solution.status is Status.APPROXIMATE or self.max_residual is None:
+            return failed
+        return failed + ["residual"] * (solution.residual > self.max_residual)
 
 
 @dataclass(frozen=True)
@@ -148,12 +136,6 @@ def hypergradient(
     solved = time.perf_counter()
     vector = unflatten(adjoint.vector, inner.params)
     mixed = {name: estimate(vector) for name, estimate in estimates.items()}
-    sensitivity = None
-    if adjoint.doubled is not None and mixed:
-        doubled = unflatten(adjoint.doubled, inner.params)
-        sensitivity = _relative_change(
-            mixed, {name: estimate(doubled) for name, estimate in estimates.items()}
-        )
     seconds = {
         "validation": validated - began,
         "solve": solved - validated,
@@ -166,12 +148,7 @@ def hypergradient(
         p_values={name: part.p_values for name, part in mixed.items()},
         seconds=seconds,
         adjoint=ImplicitAdjoint(
-            adjoint.solution,
-            adjoint.damping,
-            adjoint.damping_raises,
-            stationarity,
-            norm(right_hand_side),
-            sensitivity,
+            adjoint.solution, adjoint.damping, adjoint.damping_raises, stationarity, norm(right_hand_side)
         ),
     )
 
@@ -197,12 +174,3 @@ def curvature_rows(
         rows.append(first + torch.randperm(size, generator=generator)[:few])
         scaled.append(torch.full((few,), mass / few))
     return torch.cat(rows), torch.cat(scaled)
-
-
-def _relative_change(
-    before: Mapping[str, MixedDerivative], after: Mapping[str, MixedDerivative]
-) -> float | None:
-    old = torch.cat([part.value for part in before.values()])
-    new = torch.cat([part.value for part in after.values()])
-    size = norm(old)
-    return norm(new - old) / size if size > 0.0 else None

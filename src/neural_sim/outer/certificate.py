@@ -70,7 +70,6 @@ class ImplicitQuality:
     curvature_min: float | None
     curvature_max: float | None
     condition: float | None
-    sensitivity: float | None
 
     @staticmethod
     def of(adjoint: ImplicitAdjoint) -> ImplicitQuality:
@@ -87,7 +86,6 @@ class ImplicitQuality:
             curvature_min=damping.spectrum.smallest if damping.spectrum else None,
             curvature_max=damping.spectrum.largest if damping.spectrum else None,
             condition=damping.condition if damping.spectrum else None,
-            sensitivity=adjoint.sensitivity,
         )
 
     def parts(self) -> list[str]:
@@ -101,7 +99,6 @@ class ImplicitQuality:
             f"|dtrain| {self.stationarity:.2g}",
             f"{self.solver_status} {self.solver_steps} steps res {self.solver_residual:.1g}",
             f"{spectrum}lambda {self.damping:.2g}{condition}",
-            *([] if self.sensitivity is None else [f"2 lambda {self.sensitivity:.0%}"]),
         ]
 
 

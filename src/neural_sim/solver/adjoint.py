@@ -27,14 +27,13 @@ logger = logging.getLogger(__name__)
 class Adjoint:
     """The solution and its damping.
 
-    ``damping_raises`` counts the increases of lambda. ``doubled`` is the vector at twice the final lambda, or None if
-    it was not requested. The solution's ``products`` include those of every solve that was needed.
+    ``damping_raises`` counts the increases of lambda. The solution's ``products`` include those of every solve that
+    was needed.
     """
 
     solution: Solution
     damping: Damped
     damping_raises: int
-    doubled: Float[Tensor, "n"] | None
 
     @property
     def vector(self) -> Float[Tensor, "n"]:
@@ -54,7 +53,6 @@ class AdjointSolver:
         rtol, max_steps: passed to the linear solver.
         retain_graph: see ``HessianOperator``.
         max_raises: limit on the increases of lambda after negative curvature was met (a fixed lambda is never raised).
-        sensitivity: also solve at 2 lambda, to measure the influence of the damping; costs about one more solve.
     """
 
     linear: LinearSolver = field(default_factory=ConjugateGradient)
@@ -64,7 +62,6 @@ class AdjointSolver:
     max_steps: PositiveInt = 40
     retain_graph: bool = True
     max_raises: NonNegativeInt = 3
-    sensitivity: bool = False
 
     def solve(
         self,
@@ -91,19 +88,13 @@ class AdjointSolver:
             logger.info("damping: negative curvature met; lambda %.3g -> %.3g", damped.value, raised.value)
             damped, damping_raises = raised, damping_raises + 1
             solution = _after(solution, self._solve(operator, damped, b, solution.value))
-        doubled = None
-        if self.sensitivity:
-            twice = self._solve(operator, damped, b, solution.value, 2.0)
-            doubled, solution = twice.value, _after(twice, solution)
-        return Adjoint(solution, damped, damping_raises, doubled)
+        return Adjoint(solution, damped, damping_raises)
 
-    def _solve(
-        self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
-    ) -> Solution:
-        """Solve with lambda multiplied by ``times``, from the damping's Krylov search or, without one, from ``x0``."""
-        searched = damped.search(times)
+    def _solve(self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None) -> Solution:
+        """Solve, from the damping's Krylov search or, without one, from ``x0``."""
+        searched = damped.search()
         start = x0 if searched is None else searched
-        return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)
+        return self.linear.solve(Shifted(operator, damped.value), b, start, self.rtol, self.max_steps)
 
     def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
         """Make the operator of products with the undamped Hessian."""

@@ -188,9 +188,9 @@ class Damped:
         """Estimated condition number of the damped operator; nan if no spectrum was estimated."""
         return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
 
-    def search(self, times: float = 1.0) -> Search | None:
-        """Solve with lambda multiplied by ``times``, using only the estimate's products; None if there are none."""
-        return None if self.krylov is None else self.krylov.search(times * self.value)
+    def search(self) -> Search | None:
+        """Solve with lambda, using only the estimate's products; None if there are none."""
+        return None if self.krylov is None else self.krylov.search(self.value)
 
 
 class Damping(abc.ABC):
