@@ -188,7 +188,7 @@ def test_what_is_fixed_says_which_distribution():
     assert kinds == {"ns": Fixed("ns", "initial"), "oracle": Fixed("oracle", "target")}
 
 
-@pytest.mark.parametrize("baseline", ["lts", "lts_by_object", "response"])
+@pytest.mark.parametrize("baseline", ["lts", "response"])
 def test_what_compares_trainings_refuses_one_detector_that_goes_on(baseline):
     with pytest.raises(ValueError, match=f"baseline={baseline} compares trainings.*add outer.start=warm"):
         experiment(f"baseline={baseline}", "+variant=paper")

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 HYPERGRADIENTS = ("neural_sim", "auto_sim", "neural_sim_paper", "auto_sim_paper", "neural_sim_pathwise",
                   "neural_sim_reinforce")  # fmt: skip
 REINFORCE = ("auto_sim", "auto_sim_paper", "neural_sim_reinforce")
-BASELINES = (*HYPERGRADIENTS, "ns", "oracle", "lts", "lts_by_object")
+BASELINES = (*HYPERGRADIENTS, "ns", "oracle", "lts")
 RUNS = {
     "pose": ["+experiment=pose_gap", "objects.names=[pitcher,drill]"],
     "both_angles": ["+experiment=pose_gap", "objects.names=[pitcher,drill]", "parameter.pose.axis=both"],

@@ -58,7 +58,7 @@ SMALL = [
 
 
 LIT = ("field=grid_w", "field=paper_nerf_w")
-REWARDED = ("baseline=lts", "baseline=lts_by_object", "baseline=response")
+REWARDED = ("baseline=lts", "baseline=response")
 REFUSED = {
     "lights": (
         lambda a, b: a == "renderer=nerf" and a != b and "illumination" in b,
@@ -166,7 +166,7 @@ EXAMPLES = [
     ("not judged", ["baseline=neural_sim", "outer/steps=free"]),
     ("lights", ["parameter=[illumination]", "renderer=nerf"]),
     ("codes", ["renderer=nerf_w", "field=mlp"]),
-    ("going on", ["baseline=lts_by_object", "outer.start=previous"]),
+    ("going on", ["baseline=lts", "outer.start=previous"]),
     ("going on", ["outer/steps=trust_region", "outer.start=previous"]),
     (
         "untrained",

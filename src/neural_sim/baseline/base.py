@@ -26,11 +26,8 @@ class Search(Protocol):
         """Return the psi for the next training images."""
         ...
 
-    def tell(self, reward: float, by_object: Float[Tensor, "objects"]) -> None:
-        """Record the reward of a detector trained on images at the psi last asked for; larger is better.
-
-        ``by_object`` is its score on each object's class, nan for classes that validation images do not show.
-        """
+    def tell(self, reward: float) -> None:
+        """Record the reward of a detector trained on images at the psi last asked for; larger is better."""
         ...
 
     def state(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge, Lt
@@ -36,15 +36,9 @@ class LearningToSimulate:
         deviation: standard deviation of the policy, in logits of bins.
         light_deviation: standard deviation of the policy, in weights of lights.
         samples: K, the number of settings for each step.
-        rewarded: what rewards an object's psi: the score of the ``whole`` data set, or that of its own class
-            (``object``).
-        baseline: b: a ``moving_average`` of earlier rewards (the first step, which has none, uses the mean of its own
-            settings), or the mean of the step's other settings (``leave_one_out``).
-        decay: decay of the moving averages of rewards and of squared advantages.
+        decay: decay of the moving averages of rewards (b; the first step, which has no earlier ones, uses the mean of
+            its own settings) and of squared advantages.
         rounds: number of settings for each outer iteration in the budget; two take about as long as one hypergradient.
-
-    Raises:
-        ValueError: ``leave_one_out`` with a single setting.
     """
 
     name: str = "lts"
@@ -52,14 +46,8 @@ class LearningToSimulate:
     deviation: Positive = 1.0
     light_deviation: Positive = 0.3
     samples: PositiveInt = 4
-    rewarded: Literal["whole", "object"] = "whole"
-    baseline: Literal["moving_average", "leave_one_out"] = "moving_average"
     decay: Annotated[float, Ge(0), Lt(1)] = 0.8
     rounds: PositiveInt = 2
-
-    def __post_init__(self) -> None:
-        if self.baseline == "leave_one_out" and self.samples < 2:
-            raise ValueError(f"baseline.samples: leave_one_out wants at least 2, got {self.samples}")
 
     def begin(
         self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
@@ -114,10 +102,8 @@ class Policy(Search):
         return self._distribution.constrained(self._omega + self._deviation * noise)
 
     @override
-    def tell(self, reward: float, by_object: Float[Tensor, "objects"]) -> None:
-        whole = self._settings.rewarded == "whole"
-        own = torch.full_like(self._omega[:, 0], reward) if whole else by_object.to(self._omega)
-        self._rewards.append(own)
+    def tell(self, reward: float) -> None:
+        self._rewards.append(torch.full_like(self._omega[:, 0], reward))
         if len(self._rewards) < self._settings.samples:
             return
         advantages, noise = self._advantages(torch.stack(self._rewards)), torch.stack(self._noise)
@@ -132,8 +118,6 @@ class Policy(Search):
         mean, decay = rewards.mean(0), self._settings.decay
         before = mean if self._mean is None else self._mean
         above = rewards - before
-        if self._settings.baseline == "leave_one_out":
-            above = (rewards - mean) * len(rewards) / (len(rewards) - 1)
         square = above.square().mean(0)
         self._mean = decay * before + (1.0 - decay) * mean
         self._variance = square if self._variance is None else decay * self._variance + (1.0 - decay) * square

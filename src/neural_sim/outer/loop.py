@@ -206,9 +206,9 @@ class RewardLoop(OuterLoop):
     def training_step(self, batch: int, batch_idx: int) -> None:
         trained = self.train_on(self.search.ask())
         with self.timed("reward"):
-            reward, by_object = -trained.validation_loss, trained.scores.sum(1)[: len(self.psi)]
+            reward = -trained.validation_loss
         self.record(trained)
-        self.search.tell(reward, by_object)
+        self.search.tell(reward)
         self.psi.data = self.search.psi.clone()
         self.trajectory.append(self.psi.detach().clone())
 
