@@ -23,20 +23,33 @@ EDGE = (8.0 / 10.0) ** 2
 LOW, HIGH = (-0.25, -0.2, -0.3), (0.25, 0.3, 0.35)
 
 
-def scene(points, *, table=-0.3, tilt=0.0, others=()):
-    """A box on a thick table in a far round room, and other boxes."""
+def room(points, *, table=-0.3, tilt=0.0):
+    """A thick table in a far round room."""
     x, _, z = points.unbind(-1)
-    solid = box_of(points, LOW, HIGH) | (points.norm(dim=-1) > 10.0)
-    for low, high in others:
-        solid |= box_of(points, low, high)
+    solid = points.norm(dim=-1) > 10.0
     if table is not None:
         below = math.cos(tilt) * z + math.sin(tilt) * x < table
         solid |= below & (points[..., :2].norm(dim=-1) < 1.5)
     return solid
 
 
+def scene(points, *, others=(), **more):
+    """A box in the room, and other boxes."""
+    solid = room(points, **more)
+    for low, high in [(LOW, HIGH), *others]:
+        solid |= box_of(points, low, high)
+    return solid
+
+
 def found(grid, capture, box=None, up=UP):
     return find(grid, pixels_of(capture), WHOLE, capture, up, box, torch.Generator().manual_seed(0))
+
+
+def second(grid, capture):
+    """What is found from what was found in the same field before, and what that was."""
+    first = found(grid, capture)
+    generator = torch.Generator().manual_seed(0)
+    return find(grid, pixels_of(capture), WHOLE, capture, UP, None, generator, first), first
 
 
 def overlap(grid, capture, region, low=LOW, high=HIGH):
@@ -187,15 +200,33 @@ def test_a_bulge_of_the_table_between_the_arms_of_an_object_is_not_the_objects(c
     points = expand(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3))
     grid.table[box_of(points, *bulge), 0] = 0.1  # softplus(0.2) = 0.80 an edge, of which 55 % is absorbed
     grid.mark()
-    first = found(grid, capture)
-    generator = torch.Generator().manual_seed(0)
-    again = find(grid, pixels_of(capture), WHOLE, capture, UP, None, generator, first)
+    again, first = second(grid, capture)
     centres = expand(cell_centres(RESOLUTION))
     soft = box_of(centres, (CELL, CELL, -0.3 + 1.5 * CELL), bulge[1])  # above the cells that touch the table
     hard = box_of(centres, *arms[0]) | box_of(centres, *arms[1])
     assert first.region.cells[soft].float().mean() > 0.7 and not bool(again.region.cells[soft].any())
     assert torch.equal(again.region.cells[hard], first.region.cells[hard])
     assert float(again.region.cells[hard].float().mean()) > 0.9
+
+
+def test_a_low_solid_bulge_beside_an_object_is_not_the_objects(capture):
+    """As dense as the object and next to it, up to a cell of the grid higher: only its height tells it apart."""
+    bulge = (HIGH[0] - CELL, -0.1, -0.3), (HIGH[0] + 5.0 * CELL, 0.2, -0.3 + 1.1 * CELL)
+    again, first = second(painted(lambda points: scene(points, others=[bulge])), capture)
+    centres = expand(cell_centres(RESOLUTION))
+    # The hull reaches a cell beyond the object.
+    beside = box_of(centres, (HIGH[0] + 2.5 * CELL, -0.1, -0.3), bulge[1])
+    own = box_of(centres, LOW, HIGH)
+    assert bool(first.region.cells[beside].all()) and not bool(again.region.cells[beside].any())
+    assert bool(again.region.cells[own].all())
+
+
+def test_a_flat_object_keeps_what_is_lower_than_bulges_may_be(capture):
+    """A plate with a knob: what is higher than a bulge is too little to be the whole object."""
+    plate, knob = ((-0.4, -0.4, -0.3), (0.4, 0.4, -0.3 + 1.1 * CELL)), ((-0.1, -0.1, -0.3), (0.1, 0.1, 0.0))
+    grid = painted(lambda points: room(points) | box_of(points, *plate) | box_of(points, *knob))
+    again, _ = second(grid, capture)
+    assert bool(again.region.cells[box_of(expand(cell_centres(RESOLUTION)), *plate)].all())
 
 
 def test_fog_before_an_object_does_not_hide_it(standing, capture):

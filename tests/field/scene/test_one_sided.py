@@ -134,10 +134,6 @@ def test_what_one_side_shows_is_all_there(figures):
     assert figures["all"]["debris"] < 0.03
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="masks from one side take more than the object (docs/results.md, Masks from the scene)",
-)
 def test_one_side_is_as_good_as_all_around_where_both_look(figures):
     one, other = figures["side"], figures["all"]
     assert one["psnr"] > other["psnr"] - 1.0

@@ -36,6 +36,10 @@ SPECK = 64
 """Smallest number of cells in a connected part of the scene's surface; smaller parts are errors of the field."""
 APART = 1.0
 """Height in cells above the plane from which cells connect; lower, the plane's roughness would connect them."""
+CLEAR = 2.0
+"""The same in the second field: its cells are smaller, and a plane without texture bulges by more than one of them."""
+MOST = 0.5
+"""Smallest fraction of an object's solid cells above ``CLEAR``; flatter objects are searched for above ``APART``."""
 GROUND = 1.0
 """Height in cells above the plane from which samples belong to the object."""
 BULGE = 4.0
@@ -89,12 +93,18 @@ def connected_region(
 ) -> Region | None:
     """Find the connected solid part nearest to the origin; None if there is none.
 
-    ``within``, if given, holds the object and little else, so that everything solid in it is taken.
+    ``within``, if given, holds the object and little else, so that all large solid parts in it are taken. Bulges of the
+    plane connect with an object at its foot; so only what is above them is searched, and then continued down.
     """
     shows, allowed = surface.largest > SHOWS, _allowed(grid, plane, APART)
     if within is not None:
         solid = (shows | (surface.hits >= HITS)) & allowed & within
-        return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
+        clear = solid & _allowed(grid, plane, CLEAR)
+        if not bool(solid.any()):
+            return None
+        if int(clear.sum()) < MOST * int(solid.sum()):
+            return enclosed(grid, _large_parts(solid, grid.resolution), plane)
+        return _down_to_the_plane(enclosed(grid, _large_parts(clear, grid.resolution), plane), grid)
     centres = expand(cell_centres(grid.resolution))
     distance = centres.norm(dim=-1) if plane is None else plane.from_axis(centres)
     # With large cells or few steps, some rays also end in the air, so more of them must end in a solid cell.
@@ -181,6 +191,17 @@ def without_bulges(grid: SceneGrid, surface: SeenSurface, region: Region) -> Reg
         return region
     dense = absorbed > SOFT * float(absorbed[met].median())
     return replace(region, cells=region.cells & (above | dense))
+
+
+def _down_to_the_plane(region: Region, grid: SceneGrid) -> Region:
+    """Add the cells between the plane and the region's cross-section half a cell above ``CLEAR``."""
+    if region.plane is None:
+        return region
+    centres = expand(cell_centres(grid.resolution))
+    height, level = region.plane.height(centres), (CLEAR + 0.5) * grid.edge
+    raised = centres + (level - height)[:, None] * centres.new_tensor(region.plane.normal)
+    covered = region.cells[cells_of(contract(raised), grid.resolution)]
+    return replace(region, cells=region.cells | (covered & (height > 0.0) & (height < level)))
 
 
 def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:
