@@ -25,6 +25,8 @@ def test_identity_reports_an_honest_residual(symmetric, right_hand_side, spread)
     torch.testing.assert_close(solution.value, 2.0 * b)
     assert solution.status is Status.APPROXIMATE
     assert solution.residual == pytest.approx(float((b - 2.0 * matrix @ b).norm() / b.norm()))
+    with pytest.raises(ValueError, match=r"^Identity\.scale: want a number other than 0"):
+        Identity(scale=0.0)
 
 
 def test_conjugate_gradients_name_the_negative_curvature_seen():
