@@ -73,6 +73,13 @@ def test_crops_keep_the_aspect_ratio_and_vary(photos: Path) -> None:
     assert across.std() > 0.1
 
 
+def test_a_whole_photo_is_a_crop_whatever_rounding_does_to_its_size(tmp_path: Path) -> None:
+    """3 / 187 * 187 is more than 3 in floating point."""
+    Image.new("RGB", (3, 3), (0, 0, 255)).save(tmp_path / "small.png")
+    images = PhotoFolder(tmp_path, smallest=1.0).draw(3, 187, 187, torch.Generator().manual_seed(0))
+    assert torch.equal(images, torch.tensor([0.0, 0.0, 1.0])[None, :, None, None].expand_as(images))
+
+
 def test_photo_crops_are_reproducible(photos: Path) -> None:
     folder = PhotoFolder(photos)
     draws = [folder.draw(6, 12, 20, torch.Generator().manual_seed(6)) for _ in range(2)]

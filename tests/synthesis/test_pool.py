@@ -1,4 +1,4 @@
-"""A pool has the fewest renders of each combination of bins that give every bin its number, in eight bits."""
+"""A pool has the fewest renders of each combination of bins that give every bin its number; few are floats at a time."""
 
 import math
 from dataclasses import replace
@@ -9,11 +9,13 @@ import torch
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.pool import PooledSubject, pool_cells
-from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.pool import PooledSubject, pool_cells, pool_of
+from neural_sim.synthesis.scene import CHUNK, Scene
+from neural_sim.synthesis.subjects import RenderedSubject
 from neural_sim.synthesis.synthesizer import Synthesizer
-from neural_sim.types import PinholeCamera
+from neural_sim.types import Maps, PinholeCamera
 
 
 @pytest.mark.parametrize("per_bin", [1, 4, 5, 7])
@@ -59,3 +61,31 @@ def test_renders_of_a_pool_stay_in_eight_bits_until_images_are_composed(several,
     part = stored.objects[0]
     assert part.dtype == part.maps().rgb.dtype == torch.float32
     assert torch.equal(part.maps(torch.tensor([2])).opacity, as_floats.objects[0].opacity[2:3])
+
+
+class Seen(RenderedSubject):
+    """A subject whose opacity says from where it is seen, and which remembers how many views it rendered at a time."""
+
+    def __init__(self):
+        super().__init__("seen", radius=0.25)
+        object.__setattr__(self, "counts", [])
+
+    def maps(self, camera, camera_to_world, weights=None):
+        self.counts.append(len(camera_to_world))
+        opacity = (0.5 + 0.5 * camera_to_world[:, 2, 2])[:, None, None].expand(
+            -1, camera.height, camera.width
+        )
+        return Maps(torch.zeros(*opacity.shape, 3), opacity)
+
+
+def test_a_pool_is_rendered_in_chunks_and_holds_the_renders_of_its_draws():
+    subject, camera = Seen(), PinholeCamera(2, 1, 0.7)
+    distribution = SceneDistribution.of(
+        [Pose(bins=4)], Unlearned(distance=(0.5, 0.7), distance_unit="metres")
+    )
+    scene = Scene((subject,), camera, Synthesizer(ProceduralClutter()), distribution)
+    (pooled,) = pool_of(scene, 40, torch.Generator().manual_seed(0)).subjects
+    assert subject.counts == [64, 64, 32] and max(subject.counts) <= CHUNK
+    assert pooled.drawn.radius == 0.25 and pooled.maps.shape == (4, 40, 1, 2, 4)
+    wanted = scene.render(0, pooled.drawn).opacity
+    assert (pooled.maps.flatten(0, 1)[..., 3] / 255 - wanted).abs().max() <= 0.5 / 255 + 1e-6

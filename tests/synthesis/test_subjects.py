@@ -8,10 +8,13 @@ import torch
 
 from neural_sim.cameras import orbit
 from neural_sim.field.grid import GridField
+from neural_sim.objects.procedural import Procedural
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import RelaxedDraws, SceneDistribution
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.renderer.raycast import RaycastRenderer
+from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.pictures import PictureSubject
 from neural_sim.synthesis.scene import Scene
@@ -129,6 +132,15 @@ def test_an_object_that_shows_in_no_image_is_rendered_in_none():
         assert len(part) == 0 and part.rgb.shape == (0, 24, 24, 3)
 
 
+def test_a_mesh_that_shows_in_no_image_may_have_lights():
+    """As in a target set of few images, some of which are empty."""
+    subject = MeshSubject("mug", Procedural(["mug"]).load()[0].mesh, RaycastRenderer(1), LightRig(3))
+    maps = subject.maps(CAMERA, torch.zeros(0, 4, 4), torch.zeros(0, 3))
+    assert maps.rgb.shape == (0, 24, 24, 3)
+    with pytest.raises(ValueError, match="mug: want the same weights of lights for all images"):
+        subject.maps(CAMERA, torch.eye(4).expand(2, 4, 4), torch.eye(3)[:2])
+
+
 @pytest.mark.parametrize("objects_per_image", [(1, 1), (1, 2)])
 def test_training_images_show_the_pictures_whatever_psi_is(objects_per_image):
     shown = scene(objects_per_image, pictures())
@@ -157,6 +169,13 @@ def test_a_draw_says_from_where_the_picture_was_taken():
     torch.testing.assert_close(draw.phi, torch.full((2,), 0.7))
     torch.testing.assert_close(draw.rho, torch.full((2,), -1.0))
     torch.testing.assert_close(draw.distance, torch.full((2,), 2.5))
+
+
+def test_a_picture_much_longer_than_wide_keeps_a_pixel_of_width():
+    thin = PosedViews(torch.ones(1, 1, 100, 4), torch.eye(4)[None], PinholeCamera(100, 1, 0.1))
+    thin = dataclasses.replace(thin, camera_to_world=orbit(*torch.tensor([[0.3], [1.0], [3.0]])))
+    opacity = PictureSubject.of("a", thin, CAMERA).pictures[0, ..., 3]
+    assert (opacity > 0.5).sum(0).tolist() == [1] * 24
 
 
 def test_pictures_fit_into_wide_images_without_being_stretched():

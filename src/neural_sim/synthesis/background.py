@@ -182,9 +182,12 @@ class PhotoFolder:
         chosen = torch.randint(len(self.files), (n,), generator=generator).tolist()
         uniform = torch.rand((n, 3), generator=generator, dtype=torch.float64).tolist()
         images = torch.empty(n, 3, height, width)
-        for file in sorted(set(chosen)):  # every file is decoded once
+        crops: dict[int, list[int]] = {}
+        for index, file in enumerate(chosen):
+            crops.setdefault(file, []).append(index)
+        for file, indices in crops.items():  # every file is decoded once
             photo = read_picture(self.files[file]).convert("RGB")
-            for index in (i for i, other in enumerate(chosen) if other == file):
+            for index in indices:
                 images[index] = self._crop(photo, height, width, *uniform[index])
         return images.to(device)
 
@@ -198,7 +201,9 @@ class PhotoFolder:
 
     def _crop(self, photo: Image.Image, height: int, width: int, u: float, v: float, w: float) -> Tensor:
         scale = min(photo.width / width, photo.height / height) * (self.smallest + (1.0 - self.smallest) * w)
-        left, top = u * (photo.width - scale * width), v * (photo.height - scale * height)
-        box = (left, top, left + scale * width, top + scale * height)
+        # Rounding may make the largest crop a little larger than the photograph, which Pillow refuses.
+        across, down = min(scale * width, photo.width), min(scale * height, photo.height)
+        left, top = u * (photo.width - across), v * (photo.height - down)
+        box = (left, top, left + across, top + down)
         crop = photo.resize((width, height), Image.Resampling.BILINEAR, box=box)
         return torch.from_numpy(np.asarray(crop, dtype=np.float32) / 255.0).movedim(-1, 0)

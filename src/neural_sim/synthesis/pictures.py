@@ -81,7 +81,7 @@ class PictureSubject:
 def _fitted(maps: Float[Tensor, "n h w 4"], height: int, width: int) -> Float[Tensor, "n height width 4"]:
     """Return maps resized to fit into an image, with empty margins."""
     scale = min(height / maps.shape[1], width / maps.shape[2])
-    size = [round(scale * maps.shape[1]), round(scale * maps.shape[2])]
+    size = [max(1, round(scale * side)) for side in maps.shape[1:3]]
     small = resize(maps.movedim(-1, 1), size, antialias=True)
     left, top = (width - size[1]) // 2, (height - size[0]) // 2
     return pad(small, (left, width - size[1] - left, top, height - size[0] - top)).movedim(1, -1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import HARD, Draws, HardDraws, SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
-from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.scene import CHUNK, Scene
 from neural_sim.types import PinholeCamera, SceneDraw
 
 
@@ -139,11 +139,25 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: b
         draw = distribution.at_bins(named, noise)
         if distribution.lights:
             draw = replace(draw, weights=_mixed_lights(len(draw), distribution.lights, generator))
-        part = scene.render(label, draw)
-        maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
-        pooled = (maps * 255).round().to(torch.uint8).unflatten(0, (cells, per_cell))
-        subjects.append(PooledSubject(subject.name, pooled, part.draw))
+        maps, draw = _stored(scene, label, draw)
+        subjects.append(PooledSubject(subject.name, maps.unflatten(0, (cells, per_cell)), draw))
     return replace(scene, subjects=tuple(subjects))
+
+
+def _stored(scene: Scene, label: int, draw: SceneDraw) -> tuple[UInt8[Tensor, "n h w 4"], SceneDraw]:
+    """Render an object's draws in chunks, because floats take many times the memory of the bytes that are stored.
+
+    Returns:
+        The maps, and the draws with the object's radius.
+    """
+    size = (len(draw), scene.camera.height, scene.camera.width, 4)
+    maps = torch.empty(size, dtype=torch.uint8, device=scene.subjects[label].device)
+    for rows in torch.arange(len(draw)).split(CHUNK):
+        part = scene.render(label, draw.select(rows))
+        pixels = torch.cat([part.rgb, part.opacity[..., None]], -1)
+        maps[rows[0] : rows[-1] + 1] = pixels.mul_(255).round_().to(torch.uint8)
+        draw = replace(draw, radius=part.draw.radius)
+    return maps, draw
 
 
 def _mixed_lights(count: int, lights: int, generator: torch.Generator) -> Float[Tensor, "count lights"]:

@@ -72,12 +72,16 @@ def seen_by(images: Float[Tensor, "n 3 h w"], sensor: SensorDraw | None) -> Floa
 
 
 def blurred(images: Float[Tensor, "n c h w"], deviation: Float[Tensor, "n"]) -> Float[Tensor, "n c h w"]:
-    """Convolve each image with its own Gaussian, cut off at three times the largest deviation; edge pixels repeat."""
+    """Convolve each image with its own Gaussian, cut off at three times its deviation; edge pixels repeat.
+
+    An image is the same whichever others are blurred with it, so that it can be composed again without them.
+    """
     n, channels, height, width = images.shape
-    reach = max(1, int(torch.ceil(3.0 * deviation.max())))
+    own = torch.ceil(3.0 * deviation).clamp_min(1.0)
+    reach = int(own.max())
     offset = torch.arange(-reach, reach + 1, device=images.device, dtype=images.dtype)
     scale = deviation.to(images).clamp_min(1e-6)[:, None]
-    kernel = torch.exp(-0.5 * (offset / scale).square())
+    kernel = torch.exp(-0.5 * (offset / scale).square()) * (offset.abs() <= own.to(images)[:, None])
     kernel = (kernel / kernel.sum(1, keepdim=True)).repeat_interleave(channels, 0)[:, None]
     rows = images.reshape(1, n * channels, height, width)
     for edges, weights in (

@@ -358,9 +358,10 @@ class MeshSubject(RenderedSubject):
         if weights is not None:
             if self.rig is None:
                 raise ValueError(f"{self.name}: its mesh has one fixed light, got weights of lights")
-            if bool((weights != weights[0]).any()):
+            different = weights.unique(dim=0)
+            if len(different) > 1:
                 raise ValueError(f"{self.name}: want the same weights of lights for all images of its mesh")
-            lighting = self.rig.lighting(weights[0])
+            lighting = self.rig.lighting(different[0]) if len(different) else None
         return _maps_of(premultiplied(self.renderer.render(self.mesh, camera, camera_to_world, lighting)))
 
 
