@@ -58,12 +58,6 @@ def test_sets_given_one_class_are_those_of_all_images_that_show_it(fewest, most)
         assert abs(given.get(chosen, 0.0) - expected) < 5.0 * (expected / draws) ** 0.5
 
 
-@pytest.mark.parametrize("bad", [(2, 1), (-1, 1), (0, 0)])
-def test_ranges_that_are_none_are_refused(bad):
-    with pytest.raises(ValueError, match="objects_per_image"):
-        ObjectCount(*bad)
-
-
 def test_more_objects_than_classes_are_refused():
     with pytest.raises(ValueError, match="at most 2, the number of objects"):
         draw_layout(own_labels([1, 1]), 2, ObjectCount(1, 3), torch.Generator())

@@ -16,21 +16,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ObjectCount:
-    """The number of objects in an image, uniform from ``fewest`` to ``most``.
-
-    Raises:
-        ValueError: ``fewest`` is negative, or ``most`` is below ``fewest`` or 1.
-    """
+    """The number of objects in an image, uniform from ``fewest``, which may be 0, to ``most``."""
 
     fewest: int = 1
     most: int = 1
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.fewest <= self.most or self.most < 1:
-            raise ValueError(
-                f"synthesis.objects_per_image: want 0 <= fewest <= most and most of at least 1, got "
-                f"[{self.fewest}, {self.most}]"
-            )
 
     @property
     def mean(self) -> float:
