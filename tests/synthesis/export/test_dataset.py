@@ -78,6 +78,16 @@ def test_a_set_grows_and_keeps_its_images_and_ids(boxes, whole, tmp_path):
     assert contents(root) == contents(whole[0])
 
 
+def test_a_set_grows_in_the_formats_that_it_has_whatever_is_asked_for(boxes, tmp_path):
+    """Otherwise an annotation file would lack images that are in the folder."""
+    root = tmp_path / "data"
+    written(data_of(boxes, root, count=2, formats=("coco",)))
+    written(data_of(boxes, root, count=4, formats=("yolo",)))
+    assert len(json.loads((root / "annotations.json").read_text())["images"]) == 4
+    written(data_of(boxes, root, count=5, formats=("coco",)))
+    assert len(list((root / "labels").iterdir())) == len(list((root / "segment" / "images").iterdir())) == 5
+
+
 def test_several_processes_write_the_same_bytes(boxes, whole, tmp_path):
     _written_as_by_one(boxes, whole, tmp_path, workers=2)
 
@@ -170,7 +180,7 @@ def test_images_for_validation_are_spread_and_stay_so_when_a_set_grows(boxes, tm
     assert sorted(image["id"] for image in (*train["images"], *val["images"])) == [1, 2, 3, 4, 5, 6, 7]
     assert len(train["annotations"]) + len(val["annotations"]) == len(whole["annotations"])
     written(data_of(boxes, root))  # without a split nothing of the old one is left in use
-    assert not (root / "annotations_val.json").exists()
+    assert not any((root / name).exists() for name in ("annotations_val.json", "val.txt", "segment/val.txt"))
     assert "no split is made" in (root / "dataset.yaml").read_text()
     thousand = [number for number in range(1000) if spread(number, 0.1, GOLDEN)]
     assert abs(len(thousand) - 100) <= 1

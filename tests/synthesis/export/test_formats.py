@@ -9,15 +9,18 @@ import math
 import numpy as np
 import pytest
 import torch
+import yaml
 from faster_coco_eval import COCO, COCOeval_faster
 from PIL import Image
 
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.zoom import Zoom
-from neural_sim.synthesis.export.bop import depth_scale, object_ids
+from neural_sim.synthesis.export import bop
+from neural_sim.synthesis.export.bop import depth_scale, diameter_of, object_ids
 from neural_sim.synthesis.export.masks import mask_of
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
+from neural_sim.synthesis.export.yolo import write_yolo
 from neural_sim.target.bop import BopTarget
 from neural_sim.target.coco import CocoTarget
 from neural_sim.target.frames import FrameName
@@ -138,6 +141,13 @@ def test_supervision_reads_the_same_boxes(whole, place):
         assert np.allclose(found.xyxy, np.array(wanted).reshape(-1, 4), atol=1e-4)  # float32
 
 
+@pytest.mark.parametrize("name", ["mug", 'a "quoted" \\ name', "café \x7f \u2028", "\U0001f600"])
+def test_a_yaml_reader_takes_any_name(name, tmp_path):
+    write_yolo(tmp_path, [], [name], {})
+    read = yaml.safe_load((tmp_path / "dataset.yaml").read_text(encoding="utf-8"))
+    assert read["names"] == {0: name}
+
+
 # --- BOP ---
 
 
@@ -199,6 +209,22 @@ def test_bop_holds_every_field_of_the_format(boxes, whole):
             assert held["bbox_visib"] == [*first, last[0] - first[0], last[1] - first[1]]
             x0, y0, x1, y1 = item.box
             assert held["bbox_obj"] == [x0, y0, x1 - 1 - x0, y1 - 1 - y0]
+
+
+def test_the_diameter_is_the_largest_distance_also_of_what_is_flat_or_has_many_points(monkeypatch):
+    """A sheet of paper has no convex hull in space."""
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    longest = np.linalg.norm(points[:, None] - points, axis=-1).max()
+    for at_once in (7, 1000):
+        monkeypatch.setattr(bop, "AT_ONCE", at_once)
+        assert diameter_of(points) == pytest.approx(longest)
+    turn = np.linalg.qr(points[:3])[0]
+    for flat, wanted in (
+        ([[0.0, 0, 0], [3, 0, 0], [3, 4, 0], [0, 4, 0], [1, 1, 0]], 5.0),
+        ([[0.0, 0, 0], [3, 0, 0], [1, 0, 0]], 3.0),
+        ([[1.0, 1, 1]], 0.0),
+    ):
+        assert diameter_of(np.array(flat) @ turn + 0.3) == pytest.approx(wanted)
 
 
 def test_our_own_reader_takes_bop_back(boxes, whole):

@@ -21,7 +21,7 @@ import trimesh
 from jaxtyping import Float
 from PIL import Image
 from scipy.spatial import ConvexHull
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import cdist
 from trimesh.exchange.ply import export_ply
 
 from neural_sim.synthesis.export.folder import same_file, write_json, write_whole
@@ -32,6 +32,8 @@ OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Converts OpenGL's camera axes to OpenCV's."""
 LARGEST = 65535
 """The largest value in a depth image."""
+AT_ONCE = 256
+"""Number of points whose distances to all others are held in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ class Model:
         else:
             points = np.asarray(self.mesh.vertices)
             low, size = points.min(0), np.ptp(points, axis=0)
-            diameter = float(pdist(points[ConvexHull(points).vertices]).max())
+            diameter = diameter_of(points)
         sides = {f"{kind}_{axis}": float(v) for kind, values in (("min", low), ("size", size))
                  for axis, v in zip("xyz", values, strict=True)}  # fmt: skip
         return {"diameter": diameter, **sides}
@@ -70,6 +72,20 @@ class Model:
             np.diag([self.millimetres] * 3 + [1.0]) @ OPENCV @ np.linalg.inv(np.asarray(camera_to_world))
         )
         return to_camera @ np.linalg.inv(self.to_model)
+
+
+def diameter_of(points: Float[np.ndarray, "n 3"]) -> float:
+    """Return the largest distance between two points, which may all lie in a plane or on a line."""
+    centred = points - points.mean(0)
+    _, extents, axes = np.linalg.svd(centred, full_matrices=False)
+    flat = centred @ axes[extents > 1e-9 * extents[0]].T
+    if flat.shape[1] > 1:
+        points = points[ConvexHull(flat).vertices]
+    elif flat.shape[1] == 1:
+        points = points[[flat[:, 0].argmin(), flat[:, 0].argmax()]]
+    # All points of a round mesh are on its hull, and the distances of all pairs may not fit into memory.
+    starts = range(0, len(points), AT_ONCE)
+    return max(float(cdist(points[start : start + AT_ONCE], points[start:]).max()) for start in starts)
 
 
 def object_ids(class_names: Sequence[str]) -> list[int]:

@@ -12,6 +12,8 @@ from PIL import Image
 from neural_sim.synthesis.export.folder import write_json
 from neural_sim.types import LabelledImages
 
+COCO = "annotations.json"
+
 
 def write_coco(
     images: LabelledImages,
@@ -50,7 +52,7 @@ def write_coco(
         "images": entries,
         "annotations": annotations,
     }
-    path = folder / "annotations.json"
+    path = folder / COCO
     write_json(path, document)
     return path
 

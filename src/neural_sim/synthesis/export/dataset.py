@@ -16,10 +16,10 @@ from PIL import Image
 
 from neural_sim.processes import Work, WorkersLost
 from neural_sim.synthesis.export import bop
-from neural_sim.synthesis.export.coco import coco_document
+from neural_sim.synthesis.export.coco import COCO, coco_document
 from neural_sim.synthesis.export.folder import ExportFolder, opencv_entry, record_of, write_json, write_whole
 from neural_sim.synthesis.export.images import GOLDEN, ImageSource, spread
-from neural_sim.synthesis.export.yolo import write_yolo
+from neural_sim.synthesis.export.yolo import DATA, SEGMENT, write_yolo
 from neural_sim.workers import Workers, workers
 
 _log = logging.getLogger(__name__)
@@ -123,16 +123,18 @@ class DataSet:
         if self.val_fraction and not parts:
             _log.warning("export: %d images are too few for a split: none is made", len(records))
         for name in ("train", "val"):  # an earlier export may have made another split
-            (self.root / f"annotations_{name}.json").unlink(missing_ok=True)
-        if "coco" in self.formats:
+            for path in (f"annotations_{name}.json", f"{name}.txt", f"{SEGMENT}/{name}.txt"):
+                (self.root / path).unlink(missing_ok=True)
+        # Files of an earlier export would lack the new images. BOP's cannot: the folder's identity says if it has them.
+        if "coco" in self.formats or (self.root / COCO).exists():
             varies = any(
                 factor.coordinate == "magnification" for factor in self.source.scene.distribution.binned
             )
             camera = None if varies else opencv_entry(self.source.camera)
-            documents = {"annotations": records} | {f"annotations_{name}": own for name, own in parts.items()}
+            documents = {COCO: records} | {f"annotations_{name}.json": own for name, own in parts.items()}
             for name, own in documents.items():
-                write_json(self.root / f"{name}.json", coco_document(own, names, camera))
-        if "yolo" in self.formats:
+                write_json(self.root / name, coco_document(own, names, camera))
+        if "yolo" in self.formats or (self.root / DATA).exists():
             write_yolo(self.root, records, names, parts)
         if "bop" in self.formats:
             bop.write_bop(self.root, records, self.models, self.scene_size, scale)

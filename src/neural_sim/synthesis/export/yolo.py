@@ -43,7 +43,7 @@ def write_yolo(
             if not path.is_file():
                 write_whole(path, "".join(f"{text}\n" for text in lines))
         same_file(folder / name, folder / SEGMENT / "images" / name.name)
-    names = "".join(f"  {label}: {json.dumps(name)}\n" for label, name in enumerate(class_names))
+    names = "".join(f"  {label}: {_quoted(name)}\n" for label, name in enumerate(class_names))
     # The file names no root, so readers take its paths as relative to itself.
     heads = [f"{part}: {part}.txt\n" for part in parts] or [
         "train: images\nval: images # no split is made; name your own\n"
@@ -53,6 +53,12 @@ def write_yolo(
         for part, own in parts.items():
             write_whole(place / f"{part}.txt", "".join(f"./{record['file']}\n" for record in own))
         write_whole(place / DATA, text)
+
+
+def _quoted(text: str) -> str:
+    """Quote a text for YAML, which has JSON's escapes except those of characters beyond 16 bits."""
+    quoted = (json.dumps(letter)[1:-1] if ord(letter) < 0x10000 else letter for letter in text)
+    return f'"{"".join(quoted)}"'
 
 
 def box_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
