@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -45,7 +46,7 @@ class Work:
 
 
 class WorkersLost(ValueError):
-    """Workers were killed from outside; results that they had finished are kept."""
+    """Workers were killed from outside or could not start; results that they had finished are kept."""
 
 
 @contextmanager
@@ -55,22 +56,48 @@ def processes(count: int, work: Work) -> Iterator[Submit]:
     Their log records are passed on to the loggers of this process. They ignore Ctrl-C and end with this process.
 
     Raises:
-        WorkersLost: replaces a ``BrokenProcessPool`` raised inside.
+        WorkersLost: a process was killed or could not start.
     """
     context = multiprocessing.get_context("spawn")
     records: Any = context.Queue()
     listener = QueueListener(records, Here())
-    arguments = (pickle.dumps(work.task), work.threads, records, logging.getLogger().getEffectiveLevel())
-    pool = ProcessPoolExecutor(count, context, initializer=_begin, initargs=arguments)
-    listener.start()
-    try:
-        yield lambda argument: pool.submit(_run, argument)
-    except BrokenProcessPool as error:
-        raise WorkersLost("a process was killed from outside, perhaps because memory ran out") from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        listener.stop()
-        records.close()
+    with _stored(work.task) as path:
+        arguments = (path, work.threads, records, logging.getLogger().getEffectiveLevel())
+        pool = ProcessPoolExecutor(count, context, initializer=_begin, initargs=arguments)
+
+        def submit(argument: Any) -> Future[Any]:
+            try:
+                return pool.submit(_run, argument)
+            except OSError as error:  # the system allows no further process
+                reason = f"a process could not start ({error.strerror or error}); want fewer workers"
+                raise WorkersLost(reason) from error
+
+        listener.start()
+        try:
+            yield submit
+        except BrokenProcessPool as error:
+            reason = "a process was killed from outside, perhaps because memory ran out, or could not start"
+            raise WorkersLost(reason) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+            listener.stop()
+            records.close()
+
+
+@contextmanager
+def _stored(task: Callable[[Any], Any]) -> Iterator[str]:
+    """Yield the path of a file that holds the task while the context is open.
+
+    As an argument of a process, the task would go through a pipe. If the process ended before it had read all of it,
+    this one would wait forever, as it holds the other end of the pipe itself.
+    """
+    with tempfile.NamedTemporaryFile(prefix="neural-sim-") as file:
+        try:
+            file.write(pickle.dumps(task))
+            file.flush()
+        except OSError as error:
+            raise ValueError(f"workers: {file.name} cannot be written: {error.strerror or error}") from error
+        yield file.name
 
 
 class Here(logging.Handler):
@@ -83,13 +110,13 @@ class Here(logging.Handler):
             own.handle(record)
 
 
-def _begin(pickled: bytes, threads: int, records: Any, level: int) -> None:
+def _begin(path: str, threads: int, records: Any, level: int) -> None:
     global _task
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(threads)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     logging.basicConfig(level=level, handlers=[QueueHandler(records)], format="%(message)s", force=True)
-    _task = pickle.loads(pickled)
+    _task = pickle.loads(Path(path).read_bytes())
 
 
 def _end_with_parent() -> None:
