@@ -85,8 +85,6 @@ def test_nothing_of_hydras_reaches_the_user_and_it_takes_no_more_than_three_seco
 def test_a_task_may_get_its_path_from_elsewhere():
     for words in (["--cfg", "job"], ["+experiment=mine"], ["--config-dir=mine"], ["predict.images=*.png"]):
         present(["stages=[predict]", *words])
-    with pytest.raises(UserError, match=r"predict.images is not given"):
-        present(["stages=[predict]", "predict.model=null"])
 
 
 def test_all_documented_commands_are_let_through():

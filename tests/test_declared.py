@@ -46,6 +46,32 @@ def test_a_value_out_of_its_range_is_refused(node, message):
         check_early(node, "outer")
 
 
+TOGETHER = [
+    (
+        "export",
+        "ExportTask",
+        {"width": 640, "height": None},
+        "export.width: want width and height or neither, got 640 and",
+    ),
+    (
+        "predict",
+        "PredictTask",
+        {"images": None},
+        "predict.images: want a picture, a folder or a pattern in quotes, got N",
+    ),
+]
+
+
+@pytest.mark.parametrize(("where", "name", "values", "message"), TOGETHER)
+def test_rules_of_tasks_are_those_of_their_classes(where, name, values, message):
+    """The same rule, whether its source is read or the class is made."""
+    target = f"neural_sim.tasks.{where}.{name}"
+    with pytest.raises(UserError, match=f"^{message}"):
+        check_early({"_target_": target, **values}, where)
+    with pytest.raises(UserError, match=f"^{message.replace(where, name, 1)}"):
+        pkgutil.resolve_name(target)(**values)
+
+
 def test_what_cannot_be_read_is_left_to_others():
     check_early({**NODE, "steps": 3, "no_such_setting": 1}, "outer")
     check_early({"_target_": "other.package.Class", "size": "large"}, "part")

@@ -29,7 +29,7 @@ MISTAKES = [  # what is typed, where {here} is a folder with an empty one, and w
     ("seed=one", "seed: want a whole number, got 'one'"),
     ("objects=photos", "objects.root is not given: want a folder that holds a folder for each object, "),
     ("outer.iterations=0", "outer.iterations: want at least 1, got 0"),
-    ("export export.width=640", "export: want width and height or neither, got 640 and None"),
+    ("export export.width=640", "export.width: want width and height or neither, got 640 and None"),
     ("--scale smoke", "--scale smoke: want scale=smoke, without dashes"),
     ("demo --scale=smoke", "--scale=smoke: want scale=smoke, without dashes"),
     ("demo --smoke", "--smoke: no such flag; want scale=smoke"),
@@ -49,7 +49,7 @@ MISTAKES = [  # what is typed, where {here} is a folder with an empty one, and w
     ("viewer", "viewer: no such command or experiment; did you mean view?"),
     ("objekts=photos", "objekts: unknown key; did you mean objects?"),
     ("objects=photo", "objects=photo: no such choice; did you mean objects=photos?"),
-    ("predict", "predict.images is not given: want a picture, a folder or a pattern in quotes, predict.images=..."),
+    ("predict", "predict.images: want a picture, a folder or a pattern in quotes, got None"),
 ]  # fmt: skip
 
 

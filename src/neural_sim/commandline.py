@@ -168,7 +168,7 @@ def present(words: Sequence[str]) -> None:
     """Refuse paths that do not exist, before anything heavy is imported; patterns and sweeps are not checked.
 
     Raises:
-        UserError: a path does not exist, or a task lacks one; the message says what the key wants.
+        UserError: a path does not exist; the message says what the key wants.
     """
     given = {key: value for key, _, value in (word.lstrip("+").partition("=") for word in words)}
     for key, value in given.items():
@@ -176,12 +176,6 @@ def present(words: Sequence[str]) -> None:
         plain = key in PATHS and path != "null" and not set(path) & set("*?[{$,")
         if plain and not Path(path).expanduser().exists():
             raise UserError(f"{key}: {path} does not exist; want {PATHS[key]}")
-    whole = not any(key == "experiment" or key.startswith("-") for key in given)  # nothing else sets anything
-    if whole and given.get("stages") == "[predict]" and "predict.images" not in given:
-        raise UserError(f"predict.images is not given: want {PATHS['predict.images']}, predict.images=...")
-    width, height = given.get("export.width"), given.get("export.height")
-    if whole and given.get("stages") == "[export]" and (width is None) != (height is None):
-        raise UserError(f"export: want width and height or neither, got {width} and {height}")
 
 
 def _check_stages(word: str, value: str, layout: Layout, words: Sequence[str]) -> None:

@@ -16,10 +16,13 @@ from typing import Any
 
 import annotated_types
 
-from neural_sim import ranges
+from neural_sim import commandline, ranges
 
 PACKAGE = Path(__file__).parent
-_LIGHT = {module.__name__: vars(module) for module in (annotated_types, collections.abc, ranges, typing)}
+_LIGHT = {
+    module.__name__: vars(module)
+    for module in (annotated_types, collections.abc, commandline, ranges, typing)
+}
 """Modules that declarations may import from, with their names."""
 
 
@@ -42,6 +45,7 @@ def check_early(node: Any, where: str) -> None:
             check_early(value, f"{where}.{key}")
         elif key in types:
             ranges.check(value, types[key], f"{where}.{key}")
+    ranges.check_together(node, types, where)
 
 
 @functools.cache

@@ -58,6 +58,13 @@ class Matching(BaseMetadata):
 
 
 @dataclass(frozen=True)
+class With(BaseMetadata):
+    """Marks an argument that is given, that is, not null, if and only if the argument ``other`` is."""
+
+    other: str
+
+
+@dataclass(frozen=True)
 class Misfit:
     """A value that does not fit its type: where it stands, what is wanted, what was got (None: the key is unknown)."""
 
@@ -100,6 +107,7 @@ def validated(made: _Class) -> _Class:
         hints = hints_of(made)
         for name, value in given.items():
             check(value, hints.get(name, Any), f"{type(self).__name__}.{name}")
+        check_together(given, hints, type(self).__name__)
         construct(self, *args, **kwargs)
 
     made.__init__ = check_and_construct
@@ -119,6 +127,21 @@ def check(value: Any, hint: Any, where: str) -> None:
     found = misfit(value, hint, where)
     if found is not None:
         raise UserError(str(found))
+
+
+def check_together(values: Mapping[str, Any], hints: Mapping[str, Any], where: str) -> None:
+    """Raise ``UserError`` if one of two values that belong together is given and the other one is not.
+
+    Args:
+        values: arguments of a class by name; those that are left out count as null.
+        hints: their types, some of which may be marked by ``With``.
+        where: the key of the class.
+    """
+    for name, hint in hints.items():
+        for other in (marker.other for marker in parted(hint)[1] if isinstance(marker, With)):
+            one, two = values.get(name), values.get(other)
+            if (one is None) != (two is None):
+                raise UserError(f"{where}.{name}: want {name} and {other} or neither, got {one} and {two}")
 
 
 @functools.cache

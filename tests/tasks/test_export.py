@@ -154,7 +154,7 @@ def results(path, document):
 
 REFUSED = [
     (["export.count=0"], r"export\.count: want at least 1, got 0"),
-    (["export.width=null"], r"export: want width and height or neither, got None and 36"),
+    (["export.width=null"], r"export\.width: want width and height or neither, got None and 36"),
     (["export.formats=[coco,voc]"], r"export\.formats\[1\]: want one of coco, yolo, bop, got 'voc'"),
     (["export.formats=[]"], r"export\.formats: want 1 or more values and no repeated value, got \[\]"),
     (["export.image_format=gif"], r"export\.image_format: want one of jpg, png, got 'gif'"),

@@ -186,7 +186,7 @@ def empty(photos):
 
 
 REFUSED = [
-    (None, ["predict.images=null"], r"predict\.images: want a folder of pictures, a glob or a picture, got null"),
+    (None, ["predict.images=null"], r"predict\.images: want a picture, a folder or a pattern in quotes, got None"),
     (None, ["predict.images={photos}/none"], r"predict\.images: want a folder .*none, which does not exist"),
     (None, ["predict.images={photos}/*.gif"], r"predict\.images: want a folder .*\*\.gif, which no file matches"),
     (empty, ["predict.images={photos}/../empty"], r"predict\.images: no picture \(\.jpg, .* in .*empty"),

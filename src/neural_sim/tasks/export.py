@@ -20,7 +20,7 @@ from typing_extensions import override
 from neural_sim.cameras import reframed
 from neural_sim.digests import digest
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, validated
+from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, With, validated
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.page.samples import write_samples_page
 from neural_sim.stages.describe import describe, modules_of
@@ -67,14 +67,11 @@ class ExportTask(Task):
         scene_size: images per BOP scene.
         workers: number of processes; 0: this process alone; null: this process alone on a GPU, and on a CPU the cluster
             if the run has one, else one process per core.
-
-    Raises:
-        ValueError: only one of width and height is given.
     """
 
     count: PositiveInt = 1000
     psi: str = "learned"
-    width: Annotated[int, Ge(8)] | None = None
+    width: Annotated[Annotated[int, Ge(8)] | None, With("height")] = None
     height: Annotated[int, Ge(8)] | None = None
     formats: Annotated[Sequence[Format], MinLen(1), Distinct()] = ("coco",)
     val_fraction: Part = 0.1
@@ -85,10 +82,6 @@ class ExportTask(Task):
     largest_views: PositiveInt = 384
     scene_size: PositiveInt = 1000
     workers: NonNegativeInt | None = None
-
-    def __post_init__(self) -> None:
-        if (self.width is None) != (self.height is None):
-            raise ValueError(f"export: want width and height or neither, got {self.width} and {self.height}")
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:

@@ -7,17 +7,18 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from torch import Tensor
 from typing_extensions import override
 
+from neural_sim.commandline import PATHS
 from neural_sim.detector.metrics import evaluate, worthless
 from neural_sim.detector.saved_detector import DOCUMENT, SavedDetector, detect
 from neural_sim.devices import device_of
 from neural_sim.documents import write_json
 from neural_sim.pictures import check_headers
-from neural_sim.ranges import Fraction, PositiveInt, validated
+from neural_sim.ranges import Fraction, Matching, PositiveInt, validated
 from neural_sim.report.detections import draw, result_rows, save_picture, scores_table
 from neural_sim.target.photographs import PhotoFiles
 from neural_sim.target.truth import Truth, without_pixels
@@ -32,8 +33,8 @@ class PredictTask(Task):
     """Detections on photographs of any size, drawn and in COCO format, and their scores if there are annotations.
 
     Args:
+        images: a picture, a folder or a pattern (glob).
         model: a run's folder, or its ``model.safetensors``; None: this run's own, written by its report.
-        images: a folder, a glob or a picture.
         annotations: a COCO file with ground truth; None: no scores. Pictures and classes that it lacks are left out of
             the results; the pictures are drawn all the same.
         categories: category names of that file -> class names, null to leave a category out. Categories not listed
@@ -45,21 +46,19 @@ class PredictTask(Task):
         ValueError: there are no pictures, or the header of a file is not that of a picture.
     """
 
+    images: Annotated[str, Matching(bool, PATHS["predict.images"])]
     model: str | None = None
-    images: str | None = None
     annotations: str | None = None
     categories: Mapping[str, str | None] | None = None
     draw_above: Fraction = 0.3
     batch_size: PositiveInt = 16
 
     def __post_init__(self) -> None:
-        if not self.images:
-            raise ValueError("predict.images: want a folder of pictures, a glob or a picture, got null")
         check_headers(PhotoFiles(self.images, "predict.images").paths, "predict.images")
 
     @override
     def run(self, context: Context) -> None:
-        folder, photos = context.folder, PhotoFiles(str(self.images), "predict.images")
+        folder, photos = context.folder, PhotoFiles(self.images, "predict.images")
         saved = self._saved(context).to(device_of(context.config["trainer"]["accelerator"]))
         truth = self._truth(saved, photos)
         category_ids = truth.category_ids if truth else {i: i + 1 for i in range(len(saved.class_names))}
