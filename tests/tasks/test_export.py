@@ -120,6 +120,25 @@ def test_a_data_set_that_another_run_works_on_is_left_alone(base, made, tmp_path
     with locked(tmp_path / "other" / ".dataset"):
         assert _contents(export(base, tmp_path / "next", FORMATS)) == _contents(made)
     assert len(list((tmp_path / "other" / "dataset" / "images").iterdir())) == 2
+    # It is killed in the end, and its note was not lost when the same command finished meanwhile.
+    assert _contents(export(base, tmp_path / "last", FORMATS)) == _contents(made)
+    assert not (tmp_path / "other" / "dataset").exists()
+    assert not list((base / "store" / "export").glob("*.checkpoint"))
+
+
+def test_data_sets_do_not_wait_for_others_with_nearly_the_same_name(tmp_path):
+    with (
+        locked(task._lock_of(tmp_path / "set.v1")),
+        locked(task._lock_of(tmp_path / "set.v2"), wait=False) as ours,
+    ):
+        assert ours
+
+
+def test_the_folder_may_be_the_current_one(base, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    export(base, tmp_path / "run", "export.folder=.", "export.count=1")
+    assert (tmp_path / "here" / "annotations.json").is_file()
 
 
 def test_a_second_run_continues_the_folder(base, made, monkeypatch):
@@ -182,8 +201,16 @@ def test_bad_settings_are_one_line_and_leave_nothing(overrides, message, base, t
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(("overrides", "message"), [REFUSED[6], REFUSED[-1]])
-def test_bad_settings_are_refused_before_the_tasks_that_come_first(overrides, message, base, tmp_path):
+UNWRITABLE = ["export.folder=/proc/here"], r"^export\.folder: /proc/here cannot be written: "
+OTHER = (
+    ["export.folder={made}", FORMATS, "seed=9"],
+    r"^export\.folder: the images of .* were made with seed=0, now it is 9",
+)
+
+
+@pytest.mark.parametrize(("overrides", "message"), [REFUSED[6], REFUSED[-1], UNWRITABLE, OTHER])
+def test_bad_settings_are_refused_before_the_tasks_that_come_first(overrides, message, base, made, tmp_path):
+    overrides = [text.format(made=made) if "{made}" in text else text for text in overrides]
     given = [f"paths.store={tmp_path / 'store'}", "stages=[views,export]", *overrides]
     with pytest.raises(ValueError, match=message):
         export(base, tmp_path / "run", *given)

@@ -131,6 +131,29 @@ class Store:
         except ValueError as error:
             _log.warning("%s; the work goes on, but a later run could not resume it from here", error)
 
+    def revise(self, kind: str, key: str, change: Callable[[Any], State | None]) -> None:
+        """Change the state of unfinished work to which several processes write, one at a time.
+
+        If the store cannot be written to, the work goes on with a warning.
+
+        Args:
+            kind: kind of the result.
+            key: key of the result.
+            change: takes the state, None if there is none, and returns the new one; None removes it.
+        """
+        path = self._path(kind, key)
+        try:
+            with _writing(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+            with locked(path):
+                state = change(self.state(kind, key))
+                if state is None:
+                    self.forget(kind, key)
+                else:
+                    self.keep(kind, key, state)
+        except ValueError as error:
+            _log.warning("%s; the work goes on, but a later run could not resume it from here", error)
+
     def forget(self, kind: str, key: str) -> None:
         """Remove the checkpoint of the result ``key``, if there is one."""
         path = self._path(kind, key).with_suffix(CHECKPOINT)

@@ -21,7 +21,6 @@ from neural_sim.cameras import reframed
 from neural_sim.digests import digest
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, With, validated
-from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.page.samples import write_samples_page
 from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import cost_of, finer_fields
@@ -35,14 +34,16 @@ from neural_sim.synthesis.export.dataset import DataSet, Format, ImageFormat
 from neural_sim.synthesis.export.folder import MANIFEST, ExportFolder, opencv_entry, write_json, write_whole
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
-from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.tasks.context import Context, Task
+from neural_sim.types import PinholeCamera
 from neural_sim.workers import Workers
 
 _log = logging.getLogger(__name__)
 
 UNKNOWN_RADIUS = 100.0
 """Radius in millimetres assumed in BOP files for objects of unknown size."""
+MADE = ("psi", "millimetres_per_radius", "fields")
+"""Parts of a data set's identity that are known once psi is learned and the objects are loaded."""
 Part = Annotated[float, Ge(0), Lt(1)]
 
 
@@ -89,6 +90,7 @@ class ExportTask(Task):
         self._check_formats(context)
         self._workers(context)
         fields = graph.fields if self.detail == "run" else ()
+        ExportFolder(self._root(context), self._settings(context)).check(unknown=MADE)
         if self.psi == "learned":
             return [*fields, graph.learned]
         self._psi(context)  # raises if the distribution is unknown or its file is unfit
@@ -96,7 +98,7 @@ class ExportTask(Task):
 
     @override
     def run(self, context: Context) -> None:
-        root = context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser()
+        root = self._root(context)
         data, distribution = self._data_set(context, root), context.experiment.imaging.distribution
         root.parent.mkdir(parents=True, exist_ok=True)
         with locked(_lock_of(root), key="export.folder"), self._resuming(context, data):
@@ -110,6 +112,9 @@ class ExportTask(Task):
             f"{len(records)} images with {labelled} labelled objects\ndata set: {root}\nwhat is in it? open {page}"
         )
 
+    def _root(self, context: Context) -> Path:
+        return context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser().resolve()
+
     def _check_formats(self, context: Context) -> None:
         imaging = context.experiment.imaging
         zooms = any(factor.coordinate == "magnification" for factor in imaging.distribution.binned)
@@ -122,27 +127,17 @@ class ExportTask(Task):
 
     def _data_set(self, context: Context, root: Path) -> DataSet:
         x, graph = context.experiment, context.graph
-        distribution, synthesis = x.imaging.distribution, x.imaging.synthesis
-        size = (graph.camera.width, graph.camera.height) if self.width is None else (self.width, self.height)
-        camera = reframed(graph.camera, *cast(tuple[int, int], size))
-        workers = self._workers(context)
+        camera, workers = self._camera(context), self._workers(context)
         psi, models = self._psi(context), models_of(graph.objects)
         stages = graph.fields if self.detail == "run" else finer_fields(graph, camera, self.largest_views)
-        renderer = x.imaging.renderer
-        scene = graph.scene.showing(graph.subjects(stages, renderer))
+        scene = graph.scene.showing(graph.subjects(stages, x.imaging.renderer))
         millimetres = tuple(model.millimetres for model in models)
-        identity = {
-            "seed": x.run.seed,
-            "classes": list(graph.names),
-            "camera": opencv_entry(camera),
-            "psi": _rounded_probabilities(distribution, psi, graph.names),
-            "distribution": describe(distribution.drawn),
+        identity = self._settings(context) | {
+            "psi": _rounded_probabilities(x.imaging.distribution, psi, graph.names),
             "millimetres_per_radius": list(millimetres),
             "fields": [stage.key for stage in stages],
-            **({"empty_fraction": self.empty_fraction} if self.empty_fraction else {}),
-            **self._look(renderer, synthesis),
         }
-        ExportFolder(root, identity).check()  # checked before fitting fields, which may take minutes
+        ExportFolder(root, identity).check()  # before finer fields are fitted, which may take minutes
         if cost := cost_of(stages, graph.fields, context.results):
             _log.info("export: %s", cost)
         for stage in context.results.free_first(context.shown(stages, "field")):
@@ -159,19 +154,27 @@ class ExportTask(Task):
     def _resuming(self, context: Context, data: DataSet) -> Iterator[None]:
         """Resume the data set of a killed run of the same command, and note in the store where this run writes.
 
-        The note is removed when the data set is finished.
+        Each run of the command has a note, which is removed when its data set is finished.
         """
         if self.folder is not None:  # a folder that the user names is resumed in place
             yield
             return
         run, what = context.experiment.run, {"count": self.count, "formats": list(self.formats)}
         store, key = Store(run.store), digest({**what, "identity": data.identity})
-        state = store.state("export", key) if run.resume else None
-        if state is not None and not data.root.exists():
-            _move_unfinished(Path(state["folder"]), data)
-        store.keep("export", key, {"folder": str(data.root.resolve())})
+        own, notes = str(data.root.resolve()), (store.state("export", key) or {}).get("folders", ())
+        moved = None
+        if run.resume and not data.root.exists():
+            moved = next((folder for folder in reversed(notes) if _move_unfinished(Path(folder), data)), None)
+
+        def noted(state: Any, *ours: str) -> dict[str, list[str]] | None:
+            """Return the notes of the other runs whose folders still exist, and our own."""
+            held = (state or {}).get("folders", ())
+            others = [f for f in held if f not in (own, moved) and Path(f).parent.is_dir()]
+            return {"folders": [*others, *ours]} if others or ours else None
+
+        store.revise("export", key, lambda state: noted(state, own))
         yield
-        store.forget("export", key)
+        store.revise("export", key, noted)
 
     def _psi(self, context: Context) -> Float[Tensor, "objects K"]:
         graph, distribution = context.graph, context.experiment.imaging.distribution
@@ -191,10 +194,24 @@ class ExportTask(Task):
             raise ValueError(f"export.workers: want 0 or null with trainer=gpu, got {self.workers}")
         return self.workers
 
-    def _look(self, renderer: NerfRenderer, synthesizer: Synthesizer) -> dict[str, Any]:
-        """Return the part of the identity that says how images are rendered, composed and written."""
-        described = {"renderer": describe(renderer), "synthesis": describe(synthesizer)}
+    def _camera(self, context: Context) -> PinholeCamera:
+        own = context.graph.camera
+        size = (own.width, own.height) if self.width is None else (self.width, cast(int, self.height))
+        return reframed(own, *size)
+
+    def _settings(self, context: Context) -> dict[str, Any]:
+        """Return the data set's identity without the parts ``MADE``."""
+        x = context.experiment
+        described = {
+            "renderer": describe(x.imaging.renderer),
+            "synthesis": describe(x.imaging.synthesis),
+        }
         return {
+            "seed": x.run.seed,
+            "classes": list(context.graph.names),
+            "camera": opencv_entry(self._camera(context)),
+            "distribution": describe(x.imaging.distribution.drawn),
+            **({"empty_fraction": self.empty_fraction} if self.empty_fraction else {}),
             **described,
             "image_format": self.image_format,
             "bop": {"scene_size": self.scene_size} if "bop" in self.formats else None,
@@ -203,22 +220,25 @@ class ExportTask(Task):
 
 
 def _lock_of(root: Path) -> Path:
-    """Return the path to pass to ``locked`` for a data set."""
-    return root.with_name(f".{root.name}")
+    """Return the path to pass to ``locked``, which replaces its suffix, for a data set."""
+    return root.with_name(f".{root.name}.folder")
 
 
-def _move_unfinished(left: Path, data: DataSet) -> None:
-    """Move an unfinished data set to this run's folder, unless another run is working on it."""
+def _move_unfinished(left: Path, data: DataSet) -> bool:
+    """Move an unfinished data set to this run's folder unless another run is working on it; return whether it moved."""
     if not (left / MANIFEST).is_file():
-        return
+        return False
     try:
         with locked(_lock_of(left), wait=False, key="export.folder") as ours:
-            if ours:
-                ExportFolder(left, data.identity).check()
-                shutil.move(left, data.root)
-                _log.info("export: continues the unfinished data set moved from %s", left)
+            if not ours or not left.exists():  # another run is working on it, or has moved it meanwhile
+                return False
+            ExportFolder(left, data.identity).check()
+            shutil.move(left, data.root)
     except (OSError, ValueError) as error:
         _log.warning("export: starts again; %s is left as it is (%s)", left, error)
+        return False
+    _log.info("export: continues the unfinished data set moved from %s", left)
+    return True
 
 
 def _rounded_probabilities(

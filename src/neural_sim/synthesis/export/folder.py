@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,11 +74,16 @@ class ExportFolder:
         ]
         write_json(self.root / MANIFEST, {"identity": dict(self.identity), "images": images})
 
-    def check(self) -> None:
-        """Raise what ``opened`` raises, without writing anything."""
+    def check(self, unknown: Collection[str] = ()) -> None:
+        """Raise what ``opened`` raises, and leave nothing behind.
+
+        Args:
+            unknown: parts of the identity that are not known yet, and are not compared.
+        """
         path = self.root / MANIFEST
         if self.root.exists() and not self.root.is_dir():
             raise ValueError(f"export.folder: {self.root} is a file, want a folder")
+        self._try_to_write()
         if not path.is_file():
             if self.root.is_dir() and any(self.root.iterdir()):
                 raise ValueError(
@@ -85,18 +91,32 @@ class ExportFolder:
                 )
             return
         try:
-            known = parsed_json(path.read_text(encoding="utf-8"))["identity"]
+            known = dict(parsed_json(path.read_text(encoding="utf-8"))["identity"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"export.folder: {path} is not the manifest of an export ({error!r}); want another folder"
             ) from error
-        different = first_difference(known, json.loads(json.dumps(self.identity)))
+        before, now = (
+            {key: value for key, value in tree.items() if key not in unknown}
+            for tree in (known, json.loads(json.dumps(self.identity)))
+        )
+        different = first_difference(before, now)
         if different is not None:
-            key, before, now = different
+            key, one, other = different
             raise ValueError(
-                f"export.folder: the images of {self.root} were made with {key}={before}, now it is {now}; want the "
+                f"export.folder: the images of {self.root} were made with {key}={one}, now it is {other}; want the "
                 "same settings, or another folder"
             )
+
+    def _try_to_write(self) -> None:
+        """Raise ``ValueError`` if no file can be made in the folder, or in the nearest one above it that exists."""
+        try:
+            place = next(path for path in (self.root, *self.root.absolute().parents) if path.exists())
+            with tempfile.TemporaryFile(dir=place):
+                pass
+        except OSError as error:
+            reason = error.strerror or error
+            raise ValueError(f"export.folder: {self.root} cannot be written: {reason}") from error
 
 
 def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
