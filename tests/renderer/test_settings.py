@@ -20,7 +20,7 @@ CASES = [
     (temperature_colour, {"kelvin": 300.0}, "temperature_colour.kelvin: want at least 1500.0 and at most 40000.0"),
     (PoseRefinement, {"resolution": 48}, "PoseRefinement.resolution: want a power of two of at least 32, got 48"),
     (RaycastRenderer, {"supersample": 0}, "RaycastRenderer.supersample: want at least 1"),
-    (choose_mesh_renderer, {"backend": "blender"}, "renderer.backend: want one of auto, pyrender, raycast"),
+    (choose_mesh_renderer, {"backend": "blender"}, "views.backend: want one of auto, pyrender, raycast"),
 ]  # fmt: skip
 
 

@@ -28,9 +28,15 @@ def test_without_opengl_ray_casting_takes_over_and_says_so(no_opengl, caplog):
     assert "ray casting" in caplog.text
 
 
-def test_pyrender_demanded_without_opengl_is_an_error(no_opengl):
-    with pytest.raises(RuntimeError, match="neither EGL nor OSMesa"):
-        views.choose_mesh_renderer("pyrender")
+def test_pyrender_demanded_without_opengl_is_an_error_of_that_key(no_opengl, monkeypatch):
+    for platform, tried in ((None, "egl or osmesa"), ("glx", "glx")):
+        monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+        if platform is not None:
+            monkeypatch.setenv("PYOPENGL_PLATFORM", platform)
+        with pytest.raises(
+            ValueError, match=f"^views.backend=pyrender: OpenGL cannot draw with {tried}; want"
+        ):
+            views.choose_mesh_renderer("pyrender")
 
 
 def test_a_platform_that_fails_is_passed_over(monkeypatch, caplog):

@@ -34,8 +34,11 @@ class LightRig:
 
     Directions lie on a spherical Fibonacci lattice. Temperatures are evenly spaced in mired over ``temperature_range``
     (kelvin), intensities over ``intensity_range``, both in shuffled orders, so that neither correlates with direction.
-    ``fill`` is the fraction of each light that comes from all sides. White surfaces stay within [0, 1] if ``ambient``
-    and the largest intensity add up to at most 1 and the weights lie on a simplex.
+    ``fill`` is the fraction of each light that comes from all sides.
+
+    Raises:
+        ValueError: ``ambient`` and the largest intensity add up to more than 1. Up to 1, white surfaces stay within
+            [0, 1] under all weights on the simplex.
     """
 
     anchors: Annotated[int, Ge(2)] = 6
@@ -106,7 +109,9 @@ class VariedLight:
         """
         k = self.rig.anchors
         if math.floor(count * self.anchored) < k:
-            raise ValueError(f"lights.anchored: {self.anchored} of {count} views cannot show all {k} anchors")
+            raise ValueError(
+                f"views.lights.anchored: {self.anchored} of {count} views cannot show all {k} anchors"
+            )
         uniform = torch.rand((self.mixtures, k), generator=generator, dtype=torch.float64)
         exponential = -uniform.clamp_min(1e-12).log()
         mixed = itertools.cycle(exponential / exponential.sum(-1, keepdim=True))
@@ -120,4 +125,5 @@ class VariedLight:
 def _spread(count: int, ratio: float) -> list[float]:
     """Return ``count`` evenly spaced numbers in [0, 1], ordered as the fractional parts of multiples of ``ratio``."""
     order = sorted(range(count), key=lambda i: (i * ratio) % 1.0)
-    return [order.index(i) / (count - 1) for i in range(count)]
+    rank = {i: place for place, i in enumerate(order)}
+    return [rank[i] / (count - 1) for i in range(count)]

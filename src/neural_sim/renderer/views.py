@@ -25,7 +25,7 @@ from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.renderer.rig import LightRig, VariedLight
 from neural_sim.types import PinholeCamera, PosedViews
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 Backend = Literal["auto", "pyrender", "raycast"]
 """Backend that draws meshes. auto: pyrender over EGL, else over OSMesa, else ray casting, which the log says."""
@@ -53,25 +53,23 @@ def choose_mesh_renderer(
     """Return the renderer of a backend.
 
     Raises:
-        ValueError: an unknown backend.
-        RuntimeError: ``pyrender`` is required, but no OpenGL works.
+        ValueError: an unknown backend, or ``pyrender`` although OpenGL does not work.
     """
-    check(backend, Backend, "renderer.backend")
+    check(backend, Backend, "views.backend")
     if backend == "raycast":
         return RaycastRenderer(supersample, lighting)
     platform = opengl_platform()
     if platform is None:
         if backend == "pyrender":
-            raise RuntimeError(
-                "renderer.backend=pyrender: neither EGL nor OSMesa could draw; use auto or raycast"
-            )
-        log.warning("No OpenGL (EGL, OSMesa) on this machine: meshes are drawn by ray casting, more slowly")
+            tried = " or ".join(_platforms())
+            raise ValueError(f"views.backend=pyrender: OpenGL cannot draw with {tried}; want auto or raycast")
+        _log.warning("OpenGL does not work on this machine: meshes are drawn by ray casting, more slowly")
         return RaycastRenderer(supersample, lighting)
     # PyOpenGL chooses its platform when it is first imported, so the variable must be set before.
     os.environ["PYOPENGL_PLATFORM"] = platform
     from neural_sim.renderer.mesh import PyrenderRenderer
 
-    log.info("Meshes are drawn by pyrender over %s", platform)
+    _log.info("Meshes are drawn by pyrender over %s", platform)
     return PyrenderRenderer(supersample, lighting)
 
 
@@ -82,21 +80,25 @@ def opengl_platform() -> str | None:
     This process cannot try them itself: PyOpenGL keeps its first platform, and a broken driver may abort the process.
     If PYOPENGL_PLATFORM is set, only that platform is tried.
     """
-    wanted = os.environ.get("PYOPENGL_PLATFORM")
-    for platform in (wanted,) if wanted else ("egl", "osmesa"):
+    for platform in _platforms():
         environment = {**os.environ, "PYOPENGL_PLATFORM": platform}
         try:
             run = subprocess.run(
                 [sys.executable, "-c", PROBE], env=environment, capture_output=True, timeout=PROBE_SECONDS
             )
         except subprocess.TimeoutExpired:
-            log.info("OpenGL over %s: no answer within %d s", platform, PROBE_SECONDS)
+            _log.info("OpenGL over %s: no answer within %d s", platform, PROBE_SECONDS)
             continue
         if run.returncode == 0:
             return platform
         reason = run.stderr.decode(errors="replace").strip().splitlines()
-        log.info("OpenGL over %s failed: %s", platform, reason[-1] if reason else f"exit {run.returncode}")
+        _log.info("OpenGL over %s failed: %s", platform, reason[-1] if reason else f"exit {run.returncode}")
     return None
+
+
+def _platforms() -> tuple[str, ...]:
+    wanted = os.environ.get("PYOPENGL_PLATFORM")
+    return (wanted,) if wanted else ("egl", "osmesa")
 
 
 def render_views(
