@@ -36,9 +36,9 @@ class MeshRenderer(ABC):
         camera_to_world: Float[Tensor, "n 4 4"],
         lighting: Lighting | None = None,
     ) -> Float[Tensor, "n h w 4"]:
-        """Render RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is 0.
+        """Render RGBA images in [0, 1] with straight alpha, in float32 on the CPU; colour is 0 where alpha is 0.
 
-        ``lighting`` applies to these views; None: the renderer's own.
+        ``lighting`` lights these views; None: the renderer's own lighting does.
         """
         size = (camera.width * self.supersample, camera.height * self.supersample)
         drawn = self._draw(

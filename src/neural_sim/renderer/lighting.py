@@ -13,7 +13,7 @@ from neural_sim.ranges import Fraction, Matching, NonNegative, check, validated
 
 Vector = tuple[float, float, float]
 Kelvin = Annotated[float, Ge(1500.0), Le(40000.0)]
-"""Temperatures whose colour can be computed; colder bodies are outside sRGB's gamut."""
+"""Temperatures of black bodies. Colours below about 1900 K lie outside sRGB's gamut: negative blue becomes 0."""
 
 SECOND_RADIATION_CONSTANT = 1.438777e7  # h c / k in nm K
 SRGB_FROM_XYZ = np.array(
@@ -31,7 +31,7 @@ in nm (Wyman et al. 2013)."""
 @validated
 @dataclass(frozen=True)
 class Light:
-    """A directional light. ``direction`` points towards it, in the object's frame, with any length but zero.
+    """A directional light. ``direction`` points towards it, in the object's frame; its length must not be zero.
 
     ``colour`` is sRGB and multiplies ``intensity``; a negative intensity removes light (as in affine mixtures).
     ``fill`` is the fraction that arrives from all sides, as if scattered by the walls of a room.
@@ -57,7 +57,10 @@ class Lighting:
 
 
 def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.ndarray, "n 3"]:
-    """Return the factor on the albedo at unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
+    """Return the factor on the albedo at unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0)).
+
+    Where negative intensities make it negative, it is 0.
+    """
     shade = np.full((len(normals), 3), lighting.ambient)
     for light in lighting.lights:
         towards = np.asarray(light.direction, dtype=np.float64)

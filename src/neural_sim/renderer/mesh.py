@@ -1,4 +1,4 @@
-"""Render meshes offscreen by OpenGL with pyrender, which no other module imports; ``views`` chooses the renderer."""
+"""Render meshes offscreen with pyrender (OpenGL), which no other module imports; ``views`` chooses the renderer."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ class PyrenderRenderer(MeshRenderer):
 
 
 def _primitives(surface: Surface) -> pyrender.Mesh:
-    """Build the front faces of each texture, and the same faces reversed, with the light on their inner side.
+    """Build the faces of each texture twice: as they are, and reversed, with the light on their inner side.
 
-    Faces that face away are culled, so that exactly one of the two is seen and they never overlap in depth.
+    Faces seen from behind are culled, so that exactly one of the two is drawn and they never compete in depth.
     """
     sides = []
     for page in np.unique(surface.page).tolist():

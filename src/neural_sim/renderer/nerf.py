@@ -28,7 +28,7 @@ class NerfRenderer:
 
     Args:
         rays_per_chunk: number of rays rendered at once, which bounds the working memory.
-        termination: transmittance behind which samples are skipped (0: none).
+        termination: transmittance below which the rest of a ray is skipped (0: nothing is).
         step: factor on the field's step.
     """
 
@@ -90,8 +90,8 @@ class NerfRenderer:
     ) -> tuple[Maps, list[Maps]]:
         """Render like ``render``, with m derivatives for cameras that move at ``rates``.
 
-        Derivatives with respect to a changing light follow, if the field has one. Ray directions keep unit length
-        whatever the rates, so that the rates may include that of a focal length. One pass computes values and
+        If the field has a changing light, the derivatives with respect to it follow these m. Ray directions are kept at
+        unit length whatever the rates, so that a rate may also be that of a focal length. One pass computes values and
         derivatives; beyond the maps, it takes the memory of ``rays_per_chunk`` rays.
         """
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)

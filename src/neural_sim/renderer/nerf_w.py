@@ -19,7 +19,7 @@ from neural_sim.types import Maps, PinholeCamera, Rays
 class NerfWRenderer(NerfRenderer):
     """A ``NerfRenderer`` whose views have weights over the field's anchors, normally adding up to 1.
 
-    A view's code is ``weights @ field.anchors`` (paper, Sec. 3.2). Views of equal weights are rendered as one batch
+    A view's code is ``weights @ field.anchors`` (paper, Sec. 3.2). Views with equal weights are rendered as one batch
     under one code. Opacity does not depend on the weights. Without weights, all anchors have the same weight.
     """
 
@@ -63,7 +63,7 @@ class NerfWRenderer(NerfRenderer):
         Float[Tensor, "views height width"],
         Float[Tensor, "views height width"],
     ]:
-        """Render like ``render``, with depth, see ``NerfRenderer.render_surface``."""
+        """Render like ``render``, with the depth of ``NerfRenderer.render_surface``."""
         field, weights = _checked(field, weights, len(camera_to_world))
         maps = camera_to_world.new_empty(len(camera_to_world), camera.height, camera.width, 5)
         for light, views in _groups(weights, maps.device):

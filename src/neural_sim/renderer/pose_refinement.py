@@ -46,8 +46,8 @@ VIEWS_AT_ONCE = 16
 class PoseRefinement:
     """Corrects poses in rounds: each fits a small field, then moves the cameras by Gauss-Newton steps.
 
-    Coarse fields correct cameras that are far off, but also shift correct ones. Fields of the last third of the rounds
-    have twice the resolution and twice the optimiser steps, and move those back.
+    Coarse fields correct cameras that are far off, but also shift correct ones. In the last third of the rounds (rounded
+    down), fields have twice the resolution and twice the optimiser steps, and move these cameras back.
 
     Args:
         rounds: number of times a field is fitted; 0: the given poses are kept.
@@ -238,7 +238,7 @@ def onto(poses: Float[Tensor, "views 4 4"], given: Float[Tensor, "views 4 4"]) -
     """Move the poses by the least-squares similarity that takes their cameras to the given ones (Umeyama 1991).
 
     It is fitted to the cameras' positions and to the points one object radius away along each camera's axes, so that
-    two cameras determine it.
+    even one camera determines it.
     """
     matrix, _, _ = procrustes(_points(poses), _points(given), reflection=False)
     similarity = torch.from_numpy(matrix).to(poses)

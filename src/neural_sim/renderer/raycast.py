@@ -39,7 +39,7 @@ class RaycastRenderer(MeshRenderer):
 def _cast(
     mesh: trimesh.Trimesh, surface: Surface, pyramids: Sequence[Pyramid], camera: PinholeCamera, pose: Tensor
 ) -> Float[np.ndarray, "h w 4"]:
-    """Cast a ray through each pixel's centre, but four through a silhouette's pixel; return premultiplied RGBA."""
+    """Cast a ray through each pixel's centre, or four through a pixel on a silhouette; return premultiplied RGBA."""
     bundle = rays(camera, pose)
     origins, directions = bundle.origins.reshape(-1, 3).numpy(), bundle.directions.reshape(-1, 3).numpy()
     image = _trace(mesh, surface, pyramids, camera, origins, directions)

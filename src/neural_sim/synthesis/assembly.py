@@ -1,4 +1,4 @@
-"""From objects rendered alone to labelled images of one or more, which can be composed again from other renders."""
+"""Labelled images, composed of renders of one object each; they can be composed again from other renders."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class RenderedObject:
         )
 
     def select(self, index: Int[Tensor, "k"]) -> RenderedObject:
-        """Return some of the renders, without the fields that reproduce or differentiate them."""
+        """Return some of the renders, without what would reproduce or differentiate them."""
         there = index.to(self.rgb.device)
         return RenderedObject(self.draw.select(index), self.rgb[there], self.opacity[there])
 
@@ -122,7 +122,7 @@ def one_each(
 
 @dataclass(frozen=True)
 class Shared:
-    """Images of several objects. ``place[i, l]`` is the number of the render in layer l of image i, -1 for none."""
+    """Images of several objects. Layer l of image i shows render number ``place[i, l]`` of its object; -1: nothing."""
 
     objects: tuple[RenderedObject, ...]
     layout: Layout
@@ -197,7 +197,7 @@ class Shared:
         return lambda rgb, opacity: self.images(rows, columns, Maps(rgb, opacity))
 
     def repeated(self, index: Int[Tensor, "m"], label: int, part: RenderedObject) -> Shared:
-        """Return the images ``index`` with renders of ``part`` (class ``label``), in order, as their own objects."""
+        """Return the images ``index``; the renders of ``part`` (class ``label``), in order, replace their column 0."""
         place = self.place[index].clone()
         place[:, 0] = torch.arange(len(index))
         objects = [part if i == label else other for i, other in enumerate(self.objects)]

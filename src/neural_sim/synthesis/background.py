@@ -43,7 +43,7 @@ class ProceduralClutter:
     """Indoor-like clutter: smooth noise in random colours under textured, shaded rectangles and ellipses.
 
     Args:
-        octaves: octaves of noise, from 2 cells across the image and doubling.
+        octaves: number of octaves of noise; the first has 2 cells across the image, and each doubles them.
         contrast: amplitude of the noise.
         shapes: number of shapes in an image, drawn from far to near.
         distractors: fraction of shapes that are saturated red or blue, so that no object can be found by colour alone.
@@ -151,7 +151,7 @@ class ProceduralClutter:
 class PhotoFolder:
     """Random crops of the photographs under a folder, resized.
 
-    ``smallest`` is the side of the smallest crop relative to the largest.
+    ``smallest`` is the side of the smallest crop, as a fraction of that of the largest.
 
     Raises:
         ValueError: the folder does not exist or has no photograph, or a file's header cannot be read.

@@ -22,7 +22,7 @@ def composite(
 def draw_shift(
     n: int, fraction: float, height: int, width: int, generator: torch.Generator
 ) -> Int[Tensor, "n 2"]:
-    """Draw shifts (right, down) in whole pixels, uniform within ``fraction`` of width and height on either side."""
+    """Draw shifts (right, down) in whole pixels, uniform up to ``fraction`` of width and height either way."""
     reach = torch.tensor([int(fraction * width), int(fraction * height)])
     uniform = torch.rand((n, 2), generator=generator, dtype=torch.float64)
     return (uniform * (2 * reach + 1)).floor().long() - reach

@@ -2,6 +2,7 @@
 
 The number of objects in an image is uniform in a range. Their classes differ, and each set of a given size is equally
 likely. Every image has a class of its own, so that all classes get equally many images; the others follow at random.
+Only an image of no objects does not show its own class.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class ObjectCount:
 class Layout:
     """The classes of n images, and which object is in front.
 
-    ``labels`` are the classes in each image, -1 for none; column 0 has the image's own class. If two objects are
-    equally distant, the one with the smaller ``order``, in [0, 1), is in front.
+    ``labels`` are the classes in each image, -1 for none; column 0 has the image's own class, if it shows any. If two
+    objects are equally distant, the one with the smaller ``order``, in [0, 1), is in front.
     """
 
     labels: Int[Tensor, "n most"]

@@ -1,4 +1,4 @@
-"""From scene parameters to labelled images: draw and render subjects, compose them. Every pass can be replayed."""
+"""From scene parameters to labelled images: draw, render and compose subjects. Every pass can be replayed."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
 CHUNK = 64
-"""Number of images of given draws that are rendered and composed together, which bounds the memory. It is not a
-setting, because what a seed draws depends on it."""
+"""Number of images of one object that are rendered and composed together, which bounds the memory. It is not a setting,
+because what a seed draws depends on it."""
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class Synthesizer:
     Args:
         background: source of backgrounds.
         shift: largest shift within the image, as a fraction of the image's width and height.
-        threshold: opacity above which a pixel belongs to the object.
+        threshold: opacity above which a pixel belongs to the object; exports use 0.5, where depth is measured.
         minimum_area: smallest number of visible pixels for which an object gets a box.
         objects_per_image: smallest and largest number of objects in an image, all of different classes; [0, 6] includes
             images without objects.

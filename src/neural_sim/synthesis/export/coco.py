@@ -89,7 +89,7 @@ def coco_document(
 ) -> dict[str, Any]:
     """Assemble COCO's document of an exported set from its images' records, in the order of their numbers.
 
-    ``bbox``, ``area`` and ``segmentation`` (compressed run lengths) describe what is visible. An annotation has more
+    ``bbox``, ``area`` and ``segmentation`` (compressed run lengths) describe what is visible. Annotations have further
     entries: ``bbox_full``, the box around the whole silhouette, also beyond the image; ``segmentation_full``, the
     silhouette within the image; ``visibility``, the visible fraction of the silhouette's pixels; ``pose``. Objects of
     which too little is visible have no annotation. ``camera`` is the camera of all images, if they share one.

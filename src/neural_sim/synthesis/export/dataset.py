@@ -63,9 +63,9 @@ class DataSet:
     """``count`` images from ``source`` in ``root``, in ``formats``.
 
     Existing images stay in the set, with their ids, even those numbered ``count`` or more. ``identity`` is what all
-    images depend on, see ``ExportFolder``; ``models`` are the objects as BOP describes them, with depths of up to
+    images depend on, see ``ExportFolder``; ``models`` are the objects as BOP describes them, and depths reach up to
     ``farthest`` millimetres. ``val_fraction`` of the images are for validation; an image stays in its part when the set
-    grows. For ``workers`` see ``each``.
+    grows. Formats that an earlier export wrote are kept up to date. For ``workers`` see ``each``.
     """
 
     source: ImageSource
@@ -153,7 +153,7 @@ def each(
     ``folder``, to which it writes.
 
     Raises:
-        WorkersLost: a worker ended without a result, and its replacements did, too.
+        WorkersLost: workers were killed, or could not start.
     """
     if by == 0:
         yield from _here(task, numbers)

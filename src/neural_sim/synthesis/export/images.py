@@ -212,8 +212,8 @@ class Layer:
 def reach_on_image(camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], radius: float) -> Box:
     """Return whole pixels (x0, y0, x1, y1) around the image of the ball of ``radius`` about the origin.
 
-    They are clipped to the canvas, three times as wide and high as the image, on which the BOP toolkit counts pixels
-    beyond it, and are empty if the ball has no image.
+    They are clipped to a canvas three times as wide and high as the image: the BOP toolkit, too, counts pixels beyond
+    the image on such a canvas. They are empty if the ball has no image.
     """
     x, y, z = (camera_to_world[:3, :3].t() @ -camera_to_world[:3, 3]).tolist()
     sides = []

@@ -35,7 +35,8 @@ def box_of(mask: Bool[np.ndarray, "height width"]) -> Box | None:
 def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "_ 2"]]:
     """Trace a mask's closed outlines, each as its corners (x, y) along pixel edges, the largest first.
 
-    Outlines of parts go clockwise in the image, those of holes counter-clockwise; touching corners do not join parts.
+    Outlines of parts go clockwise in the image, those of holes counter-clockwise. Parts that touch only at a corner are
+    not joined.
     """
     whole = np.pad(mask, 1).astype(np.int8)
     starts: dict[tuple[int, int], list[int]] = {}
@@ -75,7 +76,7 @@ def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "_ 
 def polygon(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "corners 2"]:
     """Join the outlines of a mask into one closed polygon whose inside, by the even-odd rule, is the mask.
 
-    The polygon goes from the first outline's first corner to each outline and back, so that these ways cancel. The
+    The polygon goes from the first outline's first corner to each other outline and back, and these ways cancel. The
     polygon of an empty mask is empty.
     """
     loops = outlines(mask)

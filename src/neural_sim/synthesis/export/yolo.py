@@ -1,4 +1,4 @@
-"""YOLO's text labels: boxes next to the images, and polygons in another folder, because a set has one or the other.
+"""YOLO's text labels: boxes next to the images, and polygons in another folder, as a YOLO set has one or the other.
 
 See https://docs.ultralytics.com/datasets/detect and /segment: each line is an object, with its class and with numbers
 in units of the image's width and height.
