@@ -46,8 +46,8 @@ VIEWS_AT_ONCE = 16
 class PoseRefinement:
     """Corrects poses in rounds: each fits a small field, then moves the cameras by Gauss-Newton steps.
 
-    Coarse fields correct cameras that are far off, but also shift correct ones. In the last third of the rounds (rounded
-    down), fields have twice the resolution and twice the optimiser steps, and move these cameras back.
+    Coarse fields correct cameras that are far off, but also shift correct ones. In the last third of the rounds,
+    rounded down, fields have twice the resolution and twice the optimiser steps, and move these cameras back.
 
     Args:
         rounds: number of times a field is fitted; 0: the given poses are kept.
