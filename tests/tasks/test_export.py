@@ -186,6 +186,7 @@ REFUSED = [
      r"results\.json: pitcher\.pose: want 8 probabilities that add up to 1, got \[0\.5, 0\.5\]"),
     (lambda path: [results(path, {"psi": {n: {"pose": [1.2, -0.2, *[0.0] * 6]} for n in ("pitcher", "drill")}})],
      r"results\.json: pitcher\.pose: want 8 probabilities that add up to 1, got \[1\.2, -0\.2"),
+    (["synthesis.objects_per_image=[1,3]"], r"synthesis\.objects_per_image: want at most 2, the number of objects, got 3"),
     (["parameter=[pose,zoom]", "parameter.zoom.by=focal_length", "parameter.zoom.range=[0.5,2.0]",
       "export.formats=[bop]", "synthesis.objects_per_image=[1,2]"],
      r"export\.formats: bop has one camera for all objects of an image"),
@@ -208,7 +209,7 @@ OTHER = (
 )
 
 
-@pytest.mark.parametrize(("overrides", "message"), [REFUSED[6], REFUSED[-1], UNWRITABLE, OTHER])
+@pytest.mark.parametrize(("overrides", "message"), [REFUSED[6], *REFUSED[-2:], UNWRITABLE, OTHER])
 def test_bad_settings_are_refused_before_the_tasks_that_come_first(overrides, message, base, made, tmp_path):
     overrides = [text.format(made=made) if "{made}" in text else text for text in overrides]
     given = [f"paths.store={tmp_path / 'store'}", "stages=[views,export]", *overrides]

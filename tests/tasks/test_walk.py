@@ -188,6 +188,16 @@ def test_weights_that_do_not_exist_are_refused_before_anything_is_made(folder, r
     assert not context.account.seconds
 
 
+@pytest.mark.parametrize("stages", ["target_sets", "psi"])
+def test_more_objects_in_an_image_than_there_are_is_refused_before_fields_are_fitted(stages, tmp_path):
+    context, steps = _context(tmp_path, "synthesis.objects_per_image=[1,3]", f"stages=[field,{stages}]")
+    with pytest.raises(
+        ValueError, match=r"^synthesis\.objects_per_image: want at most 2, the number of objects, got 3"
+    ):
+        walk(context, steps)
+    assert not (tmp_path / "store").exists()
+
+
 def test_the_report_leaves_the_detector_that_was_scored_as_learned(
     folder, returned, tmp_path, capsys, caplog
 ):

@@ -159,6 +159,10 @@ class SceneStage(TrainingImagesStage):
         return replace(self, subjects=subjects)
 
     @override
+    def check(self) -> None:
+        self.synthesizer.count.check(len(self.subjects))
+
+    @override
     def make(self, results: Results) -> Scene:
         subjects = tuple(results(subject) for subject in self.subjects)
         return Scene(subjects, self.camera, self.synthesizer, self.distribution)

@@ -68,6 +68,11 @@ class TargetSetsStage(Stage[TargetSets]):
         return not self.target.renders  # so that unusable photographs are refused at once
 
     @override
+    def check(self) -> None:
+        if self.target.renders:
+            self.synthesizer.count.check(len(self.objects.names))
+
+    @override
     def make(self, results: Results) -> TargetSets:
         fields = {stage.views.object: results(stage).field for stage in self.fields}
         objects = {

@@ -22,6 +22,13 @@ class ObjectCount:
     fewest: int = 1
     most: int = 1
 
+    def check(self, classes: int) -> None:
+        """Raise ``ValueError`` if an image may have more objects than there are classes."""
+        if self.most > classes:
+            raise ValueError(
+                f"synthesis.objects_per_image: want at most {classes}, the number of objects, got {self.most}"
+            )
+
     @property
     def mean(self) -> float:
         """Mean number of objects in an image."""
@@ -70,10 +77,7 @@ def draw_layout(
     Raises:
         ValueError: ``count`` allows more objects in an image than there are classes.
     """
-    if count.most > classes:
-        raise ValueError(
-            f"synthesis.objects_per_image: want at most {classes}, the number of objects, got {count.most}"
-        )
+    count.check(classes)
     counts = count.draw(len(own), generator, present)
     keys = torch.rand((len(own), classes), generator=generator)
     keys[torch.arange(len(own)), own] = -1.0

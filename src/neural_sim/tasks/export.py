@@ -87,7 +87,7 @@ class ExportTask(Task):
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
         graph = context.graph
-        self._check_formats(context)
+        self._check_images(context)
         self._workers(context)
         fields = graph.fields if self.detail == "run" else ()
         ExportFolder(self._root(context), self._settings(context)).check(unknown=MADE)
@@ -115,8 +115,9 @@ class ExportTask(Task):
     def _root(self, context: Context) -> Path:
         return context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser().resolve()
 
-    def _check_formats(self, context: Context) -> None:
+    def _check_images(self, context: Context) -> None:
         imaging = context.experiment.imaging
+        imaging.synthesis.count.check(len(context.graph.names))
         zooms = any(factor.coordinate == "magnification" for factor in imaging.distribution.binned)
         if "bop" in self.formats and zooms and imaging.synthesis.count.most > 1:
             raise ValueError(
