@@ -38,8 +38,8 @@ def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
     """Read geometry, colours and textures from a mesh, and shade it.
 
     Raises:
-        ValueError: the mesh has no faces; or vertices or normals that are not finite, which
-            ``neural_sim.objects.repair`` mends; or a visual of another kind than colours or textures.
+        ValueError: the mesh has no faces, its vertices or normals are not finite (``neural_sim.objects.repair`` mends
+            them), or its visual is neither of colours nor of textures.
     """
     if len(mesh.faces) == 0:
         raise ValueError("renderer: the mesh has no faces")

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.renderer.rig import LightRig
-from neural_sim.renderer.views import Views, choose_mesh_renderer
+from neural_sim.renderer.views import Backend, Views, choose_mesh_renderer
 from neural_sim.stages.cameras import CommandMasksStage, MasksOfFrames, MasksStage, command_masks
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.store import from_bytes, to_bytes
@@ -189,7 +189,7 @@ class Meshes(Objects):
     has_meshes: ClassVar[bool] = True
 
     source: MeshSource
-    backend: Literal["auto", "pyrender", "raycast"] = "auto"
+    backend: Backend = "auto"
     supersample: int = 2
 
     @cached_property
