@@ -9,6 +9,7 @@ from neural_sim.field.grid import GridField
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.synthesis import distractors as distractors_module
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.distractors import Cover, Distractors
 from neural_sim.synthesis.export.images import ImageSource
@@ -58,6 +59,17 @@ def scene_with():
 
 def seeded(seed=0):
     return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("most", [1700, 700, 1])
+def test_no_more_pictures_are_kept_than_the_memory_is_for(folder, most, monkeypatch):
+    wanted = Distractors(folder).draw(20, 16, 24, seeded())
+    monkeypatch.setattr(distractors_module, "KEPT", most)
+    distractors = Distractors(folder)
+    for part, whole in zip(distractors.draw(20, 16, 24, seeded()), wanted, strict=True):
+        assert torch.equal(part.rgb, whole.rgb) and torch.equal(part.opacity, whole.opacity)
+    kept = [picture.width * picture.height for picture in distractors._pictures.values()]
+    assert len(kept) == 1 or sum(kept) <= most
 
 
 def test_numbers_sizes_and_sides_are_as_asked_for(folder):

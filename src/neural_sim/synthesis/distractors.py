@@ -19,6 +19,8 @@ from neural_sim.pictures import CUTOUT_SUFFIXES, picture_files, read_header, rea
 from neural_sim.ranges import Ascending, Fraction, NonNegativeInt, validated
 
 Size = Annotated[float, Gt(0), Le(4)]
+KEPT = 2**26
+"""Number of pixels of decoded pictures that are kept for the next images: 256 MB. A folder may hold any number."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +133,7 @@ class Distractors:
 
     def _cutout(self, file: int, side: float) -> Float[np.ndarray, "h w 4"]:
         """Return a premultiplied picture whose longer side has about ``side`` pixels."""
-        picture = self._pictures.get(file)
-        if picture is None:
-            picture = self._pictures[file] = read_picture(self.files[file]).convert("RGBA")
+        picture = self._picture(file)
         scale = side / max(picture.size)
         size = max(1, round(scale * picture.width)), max(1, round(scale * picture.height))
         # "RGBa" is premultiplied, so that the colour of transparent pixels has no influence.
@@ -141,6 +141,19 @@ class Distractors:
             size, Image.Resampling.BOX if scale < 0.5 else Image.Resampling.BILINEAR
         )
         return np.asarray(resized, dtype=np.float32) / 255.0
+
+    def _picture(self, file: int) -> Image.Image:
+        kept = self._pictures
+        if file not in kept:
+            picture = read_picture(self.files[file]).convert("RGBA")
+            free = (
+                KEPT - picture.width * picture.height - sum(one.width * one.height for one in kept.values())
+            )
+            while kept and free < 0:
+                oldest = kept.pop(next(iter(kept)))
+                free += oldest.width * oldest.height
+            kept[file] = picture
+        return kept[file]
 
     @cached_property
     def _pictures(self) -> dict[int, Image.Image]:
