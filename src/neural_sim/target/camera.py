@@ -10,7 +10,7 @@ from annotated_types import Gt, Lt
 from typing_extensions import override
 
 from neural_sim.cameras import opencv_camera, resized
-from neural_sim.ranges import Positive, PositiveInt, validated
+from neural_sim.ranges import Positive, PositiveInt, With, validated
 from neural_sim.target.base import Target
 from neural_sim.types import PinholeCamera
 
@@ -43,11 +43,10 @@ class GivenCamera(CameraSource):
             image's centre, (width - 1) / 2 and (height - 1) / 2.
 
     Raises:
-        ValueError: only one of width and height is given; both a focal length and a field of view are given; ``fy``,
-            ``cx`` or ``cy`` is given without ``fx``; or a number is out of its range.
+        ValueError: both a focal length and a field of view are given, or ``fy``, ``cx`` or ``cy`` without ``fx``.
     """
 
-    width: PositiveInt | None = None
+    width: Annotated[PositiveInt | None, With("height")] = None
     height: PositiveInt | None = None
     field_of_view_deg: Annotated[float, Gt(0), Lt(180)] | None = None
     fx: Positive | None = None
@@ -56,8 +55,6 @@ class GivenCamera(CameraSource):
     cy: float | None = None
 
     def __post_init__(self) -> None:
-        if (self.width is None) != (self.height is None):
-            raise ValueError(f"camera: want width and height or neither, got {self.width} and {self.height}")
         if self.fx is None and any(value is not None for value in (self.fy, self.cx, self.cy)):
             raise ValueError(f"camera: fy, cx and cy need fx, got fy={self.fy}, cx={self.cx}, cy={self.cy}")
         if self.fx is not None and self.field_of_view_deg is not None:
