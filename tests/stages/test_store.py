@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -197,6 +198,21 @@ def test_unfinished_work_is_found_until_its_result_stands(tmp_path):
     assert store.audit().checkpoints == [tmp_path / "field" / "a.checkpoint"]
     fetch(store, lambda: 1)
     assert store.state("field", "a") is None and not store.audit().checkpoints
+
+
+def test_processes_that_write_one_state_lose_nothing_of_each_other(tmp_path):
+    store, run = Store(tmp_path), ThreadPoolExecutor(8)
+    list(run.map(lambda n: store.revise("export", "a", lambda state: {**(state or {}), str(n): n}), range(8)))
+    assert store.state("export", "a") == {str(n): n for n in range(8)}
+    store.revise("export", "a", lambda state: None)
+    assert store.state("export", "a") is None and not store.audit().checkpoints
+
+
+def test_a_state_that_cannot_be_revised_costs_a_warning(tmp_path, caplog):
+    (tmp_path / "export").write_text("no folder")
+    Store(tmp_path).revise("export", "a", lambda state: {"at": 1})
+    (record,) = caplog.records
+    assert "cannot be written" in record.getMessage() and "the work goes on" in record.getMessage()
 
 
 @pytest.mark.parametrize("change", [_flip, _truncate, _clear, None])
