@@ -188,7 +188,7 @@ def test_weights_that_do_not_exist_are_refused_before_anything_is_made(folder, r
     assert not context.account.seconds
 
 
-@pytest.mark.parametrize("stages", ["target_sets", "psi"])
+@pytest.mark.parametrize("stages", ["target_sets", "warm_start"])
 def test_more_objects_in_an_image_than_there_are_is_refused_before_fields_are_fitted(stages, tmp_path):
     context, steps = _context(tmp_path, "synthesis.objects_per_image=[1,3]", f"stages=[field,{stages}]")
     with pytest.raises(
