@@ -1,4 +1,4 @@
-"""A pool has the fewest renders of each combination of bins that give every bin its number; few are floats at a time."""
+"""A pool has the fewest renders of each combination of bins that give every bin its number; few are ever floats."""
 
 import math
 from dataclasses import replace
