@@ -3,11 +3,12 @@
 import pytest
 import torch
 from torchmetrics.classification import MulticlassAccuracy
-from torchvision.ops import box_iou
+from torchvision.ops import batched_nms, box_iou
 
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.metrics import AveragePrecision, evaluate, mean_of, of_document
 from neural_sim.detector.protocol import Best
+from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Backbone
 from neural_sim.detector.smooth_scores import (
     THRESHOLDS,
@@ -173,6 +174,25 @@ def test_a_retinanet_s_best_are_its_predictions(tools, generator):
             torch.testing.assert_close(best.boxes[ours][:count], image["boxes"][theirs][:count])
     one = detector.best(outputs, 1)
     assert len(one.image) <= 4 * detector.num_classes
+
+
+def test_the_best_of_many_images_are_those_of_each_alone(generator, monkeypatch):
+    """They are suppressed in blocks: the time of one call for all would grow with the square of their number."""
+    detector, called = RetinaNet(3, 32, Backbone("micro")), []
+
+    def counted(boxes, scores, group, iou):
+        called.append(len(boxes))
+        return batched_nms(boxes, scores, group, iou)
+
+    monkeypatch.setattr("neural_sim.detector.protocol.batched_nms", counted)
+    logits = torch.randn(25, len(detector.anchors), 3, generator=generator)
+    code = 0.3 * torch.randn(25, len(detector.anchors), 4, generator=generator)
+    together = detector.best((logits, code), 2)
+    assert sum(called) == 25 * 100 and max(called) <= 1000
+    for number in range(25):
+        alone, own = detector.best((logits[[number]], code[[number]]), 2), together.image == number
+        for part in ("label", "logits", "boxes"):
+            assert torch.equal(getattr(together, part)[own], getattr(alone, part))
 
 
 NAMES = ("a", "b", "c")

@@ -19,6 +19,8 @@ from neural_sim.detector.settings import Detections
 Parameters = dict[str, Tensor]
 Score = Literal["AP", "accuracy"]
 """The score of predictions: COCO's average precision, or the top-1 accuracy of each image's best class."""
+SUPPRESSED = 1000
+"""Number of boxes of several images that go through non-maximum suppression together."""
 Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors code"]]
 
 
@@ -154,7 +156,17 @@ class Detector(ABC):
         anchor, label = (index // self.num_classes).flatten(), (index % self.num_classes).flatten()
         group = image * self.num_classes + label
         boxes = self.decode(code.detach()[image, anchor], anchor)
-        kept = batched_nms(boxes, top.flatten(), group, self.detections.nms_iou)
+        # In blocks of images, because the time of batched_nms grows with the square of their number.
+        block = max(1, SUPPRESSED // top.shape[1]) * top.shape[1]
+        parts = zip(
+            *(part.split(block) for part in (boxes.double(), top.flatten().double(), group)), strict=True
+        )
+        kept = torch.cat(
+            [
+                number * block + batched_nms(some, scores, own - own[0], self.detections.nms_iou)
+                for number, (some, scores, own) in enumerate(parts)
+            ]
+        )
         kept = kept[group[kept].argsort(stable=True)]
         place = torch.arange(len(kept), device=kept.device) - torch.searchsorted(group[kept], group[kept])
         image, anchor, label = (part[kept[place < per_class]] for part in (image, anchor, label))
