@@ -215,7 +215,7 @@ def test_files_that_are_missing_or_broken_are_refused(folder, tmp_path):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda params: params | {"more": torch.ones(2)}, "has more, which the detector has not"),
+        (lambda params: params | {"more": torch.ones(2)}, "has more, which the detector does not have"),
         (
             lambda params: params | {(name := next(iter(params))): params[name] * torch.nan},
             "want finite values",

@@ -18,7 +18,7 @@ from neural_sim.types import LabelledImages
 def cached_features(
     detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
 ) -> tuple[Tensor, ...]:
-    """Compute feature maps [n, channels, height, width] of images [n, 3, H, W] in [0, 1], one tensor for each level.
+    """Compute the features of images [n, 3, H, W] in [0, 1], one tensor [n, ...] for each level.
 
     They are computed batch by batch on the backbone's device (the images', if it has no parameters), without an
     autograd graph.
@@ -67,7 +67,7 @@ class CachedSet:
     ) -> CachedSet:
         """Compute what ``of`` returns for all ``sets`` concatenated, in the same batches.
 
-        Only one set and one batch are in memory at a time.
+        Only one set and an incomplete batch are in memory at a time.
 
         Raises:
             ValueError: there is no set.

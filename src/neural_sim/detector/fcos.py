@@ -69,7 +69,7 @@ class Fcos(PyramidDetector):
     It holds the network's shape, the points and the loss, but no parameters.
 
     Args:
-        points: which points are assigned to which object.
+        points: the points, and how they are assigned to objects.
         focal_alpha, focal_gamma: parameters of the focal loss (Lin et al. 2017, Eq. 5).
 
     See ``PyramidDetector`` for the other arguments, which it checks.
@@ -113,7 +113,7 @@ class Fcos(PyramidDetector):
         """Add up the focal, box and centre-ness losses of each image.
 
         The box loss uses the generalised intersection over union (Rezatofighi et al. 2019). Each loss is a sum over
-        points divided by the number of foreground points.
+        points, divided by the image's number of foreground points, if any.
         """
         (logits, code), labels = outputs, targets.labels
         wanted = (labels[..., None] == torch.arange(self.num_classes, device=labels.device)).to(logits.dtype)

@@ -119,14 +119,20 @@ def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> 
     """Explain in one line why a score is meaningless and what to do; None if it is meaningful."""
     known = [value for value in score.per_class.values() if value == value]
     if not known:
-        return "no class has a box in these images, so that nothing is scored: want labels of the classes"
+        return "no class has a box in these images, so that nothing is scored: want labels of these classes"
     if any(known):
         return None
     if isinstance(score, Accuracy):
-        return "it is 0 for every class: no image's best class is right; want more training or images nearer to these"
+        return (
+            "it is 0 for every class: no image's best class is right; want more training, or training images that look "
+            "more like these"
+        )
     count = sum(len(each["scores"]) for each in predictions)
     why = f"none of its {count} boxes lies on an object of its class" if count else "it detects nothing"
-    return f"it is 0 for every class: {why}; want more training.cold_epochs, or images whose objects are as large"
+    return (
+        f"it is 0 for every class: {why}; want more training.cold_epochs, or training images whose objects are as "
+        "large as in these"
+    )
 
 
 def best_classes(predictions: Sequence[Mapping[str, Tensor]]) -> Int[Tensor, "images"]:

@@ -161,7 +161,7 @@ class LastStages(nn.Module):
 
 
 def strided_backbone(plan: Plan, strides: tuple[int, ...], activation: str) -> Stages:
-    """Build four convolutions of stride 2; maps at strides 8 and 16 are available."""
+    """Build a backbone of four stages, each of stride 2; maps at strides 8 and 16 are available."""
     stages: dict[str, nn.Module] = {}
     before = 3
     for number, (after, residual) in enumerate(zip(plan.widths, plan.residual, strict=True)):
@@ -206,8 +206,8 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
     (``DEFAULT``, ``IMAGENET1K_V1``, ...), which torchvision downloads or takes from its cache.
 
     Raises:
-        ValueError: ``weights`` is neither a file nor a weight name, or the file's state dictionary is missing or does
-            not fit.
+        ValueError: ``weights`` is neither a file nor a name of torchvision's, the file cannot be read or downloaded, or
+            it holds no state dictionary that fits.
     """
     if Path(weights).is_file():
         try:
@@ -244,10 +244,10 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
 def build_backbone(
     architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
 ) -> Stages:
-    """Build a backbone by name; it returns a tuple of maps, and ``channels`` has their widths by stride.
+    """Build a backbone by name.
 
     Raises:
-        ValueError: the weights do not exist or do not fit.
+        ValueError: the architecture has no pretrained weights, or see ``load_weights``.
     """
     if architecture in PLANS:
         if weights is not None:
@@ -268,12 +268,12 @@ class NormalisedBackbone(nn.Module):
     @override
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         mean, std = (_channels(values, images) for values in (IMAGENET_MEAN, IMAGENET_STD))
-        # A third faster on a CPU than the default layout, forwards and backwards.
+        # On a CPU, this layout is a third faster than the default, forwards and backwards.
         return self.backbone(((images - mean) / std).contiguous(memory_format=torch.channels_last))
 
 
 def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
-    """Return one number for each channel, created on the device of ``like`` without a copy."""
+    """Return one number for each channel, on the device of ``like``, to which nothing is copied."""
     return torch.cat([like.new_full((1, 1, 1), value) for value in values])
 
 
@@ -320,7 +320,7 @@ def build_predictor(
 ) -> Predictor:
     """Build a pyramid of ``levels`` levels, with ``head`` on top of it.
 
-    Levels in excess of ``in_channels`` are coarser than the backbone's maps.
+    ``in_channels`` has the widths of the backbone's maps. Any further levels are coarser than these maps.
     """
     channels, norm = settings.channels, group_norm if settings.normalisation == "group" else None
     coarser = levels - len(in_channels)
@@ -348,11 +348,12 @@ def fixed_anchors(
 def initialise(
     module: nn.Module, generator: torch.Generator, prior_probability: float | None = None
 ) -> dict[str, Tensor]:
-    """Draw a state dictionary of ``module``: He-normal convolutions, unit normalisations, zero biases.
+    """Draw a state dictionary of ``module``, with normalisations of scale 1 and biases of 0, except for one.
 
-    In a predictor's ``head``, convolutions with a bias start at standard deviation 0.01, and the bias of the layer
-    ``cls_logits`` makes it predict ``prior_probability`` (Lin et al. 2017, Sec. 4.1). Other convolutions preserve the
-    variance of their input, as torchvision's do. A linear layer starts at standard deviation 0.01 (Goyal et al. 2017).
+    Convolutions without a bias, which an activation follows, are He-normal. Those with a bias start at standard
+    deviation 0.01 in a predictor's ``head`` (Lin et al. 2017, Sec. 4.1); elsewhere they preserve the variance of their
+    input, as torchvision's do. The bias of the layer ``cls_logits`` makes it predict ``prior_probability``. Linear
+    layers start at standard deviation 0.01 (Goyal et al. 2017).
     """
     state = {name: value.detach().clone() for name, value in module.state_dict().items()}
     for name, part in module.named_modules():

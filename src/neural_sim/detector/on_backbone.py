@@ -39,17 +39,20 @@ ImageSize = PositiveInt | tuple[PositiveInt, PositiveInt]
 class BackboneDetector(Detector):
     """A detector whose images pass through a backbone. A subclass sets ``_predictor``, the network on its features.
 
-    ``normalisation`` has the mean and the standard deviation by which the backbone first normalises the channels (red,
-    green, blue) of images in [0, 1].
+    ``normalisation`` has the mean and the standard deviation of each channel (red, green, blue), by which the backbone
+    first normalises images in [0, 1].
 
     Args:
         num_classes: number of classes, counted from 0, without a background class.
         image_size: (height, width) in pixels, or one number for a square.
         backbone: settings of the backbone.
-        strides: strides of the maps that serve as features.
+        strides: strides of the maps that serve as features, ascending.
         activation: ``silu`` or ``relu`` (torchvision's own).
         proximal: see ``Detector``.
         prior: foreground probability that the untrained predictor outputs; None: it has no such output.
+
+    Raises:
+        ValueError: the backbone's weights cannot be loaded, see ``network.load_weights``.
     """
 
     normalisation: ClassVar[dict[str, tuple[float, ...]]] = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
@@ -137,7 +140,7 @@ class BackboneDetector(Detector):
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """Compute the maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen.
+        """Compute the map [n, c, h / stride, w / stride] of each level.
 
         In the psi loop, which trains the last stages, these are the maps before those stages.
 
@@ -145,8 +148,9 @@ class BackboneDetector(Detector):
             ValueError: the images do not have the detector's size.
         """
         if tuple(images.shape[-3:]) != (3, *self.image_size):
+            height, width = self.image_size
             raise ValueError(
-                f"detector: want images of shape [n, 3, {self.image_size}], got {tuple(images.shape)}"
+                f"detector: want images of shape [n, 3, {height}, {width}], got {list(images.shape)}"
             )
         dtype = next(value.dtype for value in backbone.values() if value.is_floating_point())
         return functional_call(self._first, backbone, (images.to(dtype),), strict=True)

@@ -32,7 +32,7 @@ class Decoded(nn.Module):
 
     def __init__(self, saved: SavedDetector) -> None:
         super().__init__()
-        self.detector: Any = saved.detector
+        self.detector = saved.detector
         self.names = list(saved.params)
         for index, name in enumerate(self.names):
             self.register_buffer(f"p{index}", saved.params[name].detach().cpu())
@@ -46,12 +46,12 @@ class Decoded(nn.Module):
 
 
 def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
-    """Write ``path``: input ``images`` [n, 3, h, w] in [0, 1], any n.
+    """Write an ONNX file to ``path``, and return it. The input is ``images`` [n, 3, h, w] in [0, 1], for any n.
 
     Without ``nms`` the outputs are ``boxes`` [n, anchors, 4] and ``scores`` [n, anchors, classes], see
     ``Decoded``. With it they are the detections in all images, chosen as by ``Detector.predict``: ``image``
-    [d], ``boxes`` [d, 4], ``scores`` [d], ``labels`` [d], image by image, the best first. The file's metadata has the
-    ``class_names`` as JSON.
+    [d], ``boxes`` [d, 4], ``scores`` [d], ``labels`` [d], image by image, and best first in each. The file's metadata
+    has the ``class_names`` as JSON.
 
     Raises:
         ValueError: a package is missing.
@@ -117,14 +117,14 @@ def _quiet() -> Iterator[None]:
 
 
 INPUTS = ("anchor_boxes", "anchor_scores")
-"""The network's outputs, which are the inputs of suppression."""
+"""Names of the network's outputs, which are the inputs of non-maximum suppression."""
 
 
 def with_nms(model: Any, saved: SavedDetector) -> Any:
     """Append the steps of ``Detector.predict`` to ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``.
 
-    The appended steps take the best candidates of each level, suppress within each class, and keep the best ``limit``
-    of an image.
+    The appended steps take each level's best candidates, suppress within each class, and keep the best ``limit``
+    detections of an image.
     """
     import onnx
 
@@ -134,9 +134,8 @@ def with_nms(model: Any, saved: SavedDetector) -> Any:
 
 
 def _graph(saved: SavedDetector, opset: int, ir_version: int) -> str:
-    """Write the graph in ONNX's textual syntax; names of the nodes' results begin with ``nms_``."""
-    detector: Any = saved.detector
-    settings, per_level = detector.detections, detector.anchors_per_level or [_anchors(saved)]
+    """Write the graph in ONNX's textual syntax; names of intermediate values begin with ``nms_``."""
+    settings, per_level = saved.detector.detections, saved.detector.anchors_per_level or [_anchors(saved)]
     anchors, classes = sum(per_level), len(saved.class_names)
     nodes, levels, first = [], [], 0
     for number, count in enumerate(per_level):

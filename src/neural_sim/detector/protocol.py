@@ -25,7 +25,7 @@ Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors cod
 
 
 def score_of(make: Callable[..., Detector]) -> Score:
-    """Return the kind of score by which the detectors of a constructor from ``conf/detector`` are judged."""
+    """Return the score that judges the detectors of ``make``, a constructor as configured in ``conf/detector``."""
     while isinstance(make, functools.partial):
         make = make.func
     return getattr(make, "score", "AP")
@@ -36,7 +36,7 @@ class Best:
     """The best detections of every class in every image, ordered by image, then class, then falling score.
 
     ``boxes`` are (x0, y0, x1, y1) in pixels. ``logits`` and ``boxes`` are differentiable in the outputs they come from;
-    the choice of these outputs is not differentiated.
+    which outputs are chosen is not differentiated.
     """
 
     image: Int[Tensor, "m"]

@@ -31,10 +31,10 @@ class Real:
         mode: ``combined``: every training (warm start, psi loop, scored detectors) uses synthetic images and
             photographs. ``pretrain``: scored detectors are trained on synthetic images and then fine-tuned on
             photographs; the warm start and the psi loop see synthetic images only. ``none``: no photographs.
-        count: number of photographs; 0 means ``none``. A smaller count uses a subset of a larger one's photographs.
+        count: number of photographs; 0 means ``none``. A smaller count takes some of those that a larger one takes.
         fraction: fraction of the photographs, instead of ``count``. Without either, all of them are used.
-        batch_fraction: for ``combined``: fraction of photographs in every batch, drawn repeatedly; the number of steps
-            is the same as without them. None: photographs are used like all other images, once in every epoch.
+        batch_fraction: for ``combined``: fraction of photographs in every batch, drawn repeatedly; there are as many
+            steps as without them. None: photographs are used like all other images, once in every epoch.
         finetune: for ``pretrain``: number of steps on photographs, as a fraction of those on synthetic images.
         finetune_learning_rate: peak learning rate of these steps.
         fewer: what to do if there are fewer photographs than ``count``: ``refuse``, or take ``all`` of them with

@@ -22,8 +22,13 @@ from neural_sim.ranges import NonNegative, PositiveInt, validated
 class RetinaNet(PyramidDetector):
     """A RetinaNet for images of one size.
 
-    It holds the network's shape, the anchors and the loss, but no parameters. See ``PyramidDetector`` for the
-    arguments, which it checks.
+    It holds the network's shape, the anchors and the loss, but no parameters.
+
+    Args:
+        anchors: the anchors, and how they are assigned to objects.
+        losses: the loss of an anchor's prediction.
+
+    See ``PyramidDetector`` for the other arguments, which it checks.
     """
 
     def __init__(
@@ -60,7 +65,7 @@ class RetinaNet(PyramidDetector):
         return assign_anchors(self.anchors.to(boxes), boxes, labels, *self._overlaps)
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Sum each image's focal and box losses over anchors, and divide by the number of foreground anchors."""
+        """Sum each image's focal and box losses over anchors, and divide by the number in the foreground, if any."""
         (logits, deltas), costs = outputs, self._losses
         labels = targets.labels
         classes = torch.arange(self.num_classes, device=labels.device)

@@ -190,7 +190,7 @@ def _params(path: Path, weights: Mapping[str, Any], file: Path) -> Parameters:
 
 def _normalisation(detector: Detector) -> dict[str, list[float]] | None:
     """Return the channel normalisation that the detector declares, or None."""
-    stored = getattr(detector, "normalisation", None)
+    stored = detector.normalisation
     return None if stored is None else {key: list(values) for key, values in stored.items()}
 
 
@@ -215,7 +215,7 @@ def _check_params(params: Parameters, detector: Detector, path: Path) -> None:
             raise ValueError(f"{path}: {name}: want finite values")
     strange = sorted(set(params) - set(shapes))
     if strange:
-        raise ValueError(f"{path}: has {strange[0]}, which the detector has not")
+        raise ValueError(f"{path}: has {strange[0]}, which the detector does not have")
 
 
 def _sha256(path: Path) -> str:
@@ -226,7 +226,7 @@ def _sha256(path: Path) -> str:
 def detect(saved: SavedDetector, photos: Sequence[Image.Image]) -> list[dict[str, Tensor]]:
     """Detect objects in photographs.
 
-    Photographs are letterboxed like those of a target set. Detections that lie only in the grey border are left out.
+    Photographs are letterboxed like those of a target set. Detections that lie wholly in the grey border are left out.
 
     Returns:
         For each photograph, best first, on the CPU: boxes [d, 4] as (x0, y0, x1, y1) in its pixels and within it,

@@ -26,7 +26,7 @@ ARCHITECTURES: dict[Architecture, tuple[int, ...]] = {
 }
 """Strides of the backbones' maps."""
 SAVED = "saved"
-"""``Backbone.weights`` of a detector read from a model file, which contains their values."""
+"""``Backbone.weights`` of a detector read from a model file, which contains the values."""
 
 
 @validated
@@ -112,10 +112,10 @@ class Points:
 
     Args:
         strides: strides of the pyramid's levels, as in ``Anchors``; a level has one point per stride.
-        limits: for all levels but the last, the largest distance from a point to a side of its box, in pixels of an
-            image whose shorter side is ``reference``; larger distances belong to the next level.
+        limits: for all levels but the last, the largest distance from a point to the farthest side of its box, in
+            pixels of an image whose shorter side is ``reference``; larger distances belong to the next level.
         reference: that side in pixels; None: limits are in pixels of any image.
-        radius: largest distance, in strides and along each axis, from a point to the centre of its box.
+        radius: a point detects a box only if it is less than this many strides from its centre, along each axis.
     """
 
     strides: Sequence[PositiveInt] = (8, 16)
@@ -157,7 +157,7 @@ class Losses:
 class Detections:
     """How detections are selected from predictions.
 
-    The ``candidates`` best scores of each level above ``score_threshold`` go through non-maximum suppression within
+    Each level's ``candidates`` best scores, if above ``score_threshold``, go through non-maximum suppression within
     each class at ``nms_iou``; the best ``limit`` of an image are kept.
     """
 

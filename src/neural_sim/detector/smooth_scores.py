@@ -49,8 +49,8 @@ class SmoothAP:
         temperature: width of the ranks' sigmoid, in logits; AP is the limit at 0.
         width: width of the true positives' sigmoid, in intersection over union; AP is the limit at 0.
         per_class: number of best detections of each class in an image that count.
-        loss: weight of the training loss that is added: the AP of a class without true positives has no gradient, but
-            its loss does.
+        loss: weight of the training loss that is added, because a class without true positives has an AP without
+            gradient, but a loss with one.
     """
 
     temperature: Positive = 0.2
@@ -152,8 +152,8 @@ class SmoothAccuracy:
 
     Args:
         temperature: temperature of the softmax, in logits; accuracy is the limit at 0.
-        loss: weight of the training loss that is added: for an image whose class is far from the best, that probability
-            has hardly any gradient, but the loss does.
+        loss: weight of the training loss that is added, because that probability has hardly any gradient for an image
+            whose class is far from the best, but the loss has one.
     """
 
     temperature: Positive = 0.5

@@ -199,10 +199,13 @@ def _flat(tensors: Iterable[Tensor]) -> Tensor:
 class Training:
     """Training settings that detectors share, whichever method chose their images.
 
-    ``image_size`` is the side of the square images in pixels. ``images_per_object`` is the number of training images of
-    each object. ``warm_start`` is the distribution of the warm start's images: all parameters uniform, or the initial
-    psi. ``warm_epochs`` are the epochs of the warm start, ``cold_epochs`` those of the detectors that are scored.
-    ``real`` says how training uses labelled photographs. For the rest see ``Optimisation``.
+    Args:
+        image_size: side of the square images in pixels.
+        images_per_object: number of training images of each object.
+        warm_start: distribution of the warm start's images: all parameters uniform, or the initial psi.
+        warm_epochs, cold_epochs: epochs of the warm start, and of the detectors that are scored.
+        batch_size, learning_rate, weight_decay: see ``Optimisation``.
+        real: how training uses labelled photographs.
 
     Raises:
         ValueError: batches of one image cannot mix photographs with synthetic images.
@@ -300,17 +303,17 @@ def train_detector(
     Args:
         detector: the detector.
         params: the initial parameters.
+        images: the images, on the device of ``params``. If they are given as features, what follows these is trained,
+            otherwise what the detector declares as ``learnable``.
         generator: shuffles the batches.
         how: the optimiser and its budget.
-        images: the images, on the device of ``params``. If they are given as features, or the detector freezes its
-            backbone, only the pyramid and the head are trained.
         anchor: theta_0; adds the detector's proximal term over the trained parameters to the loss. None: no such term.
         recording: which of the steps the history keeps (None: none).
         sampling: how batches are drawn from ``images`` (None: each image once in every epoch).
 
     Returns:
-        All parameters (new, detached tensors for the trained ones, the given tensors for the frozen ones), and the
-        history, whose losses exclude the proximal term.
+        All parameters (new, detached tensors for the trained ones, the given tensors for the others), and the history,
+        whose losses exclude the proximal term.
 
     Raises:
         ValueError: there are no images, the recording does not fit its memory limit, or the loss stops being finite.

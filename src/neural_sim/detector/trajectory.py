@@ -1,7 +1,8 @@
 """A training as pure functions of flat vectors, and its record, so that it can be differentiated in reverse.
 
 A state is theta followed by the optimiser's buffers. A step consists of elementwise torch operations, which autograd
-can differentiate. The record has the batches, learning rates, states and gradients of the steps.
+can differentiate. The record has the batches, learning rates and gradients of the steps, and the states before some of
+them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class AdamW:
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019, Algorithm 2).
 
     It steps as ``torch.optim.AdamW`` does. ``weight_decay`` is one number, or one for each entry of theta. The buffers
-    are the two moments. ``floor`` is a lower bound of the denominator, entry by entry.
+    are the two moments. ``floor`` is a lower bound of the denominator: one number, or one for each entry.
     """
 
     weight_decay: float | Float[Tensor, "n"] = 1e-2
