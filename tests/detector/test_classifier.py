@@ -125,7 +125,7 @@ def test_it_learns_colours(tools):
         ),
         (
             lambda: make().features({}, torch.zeros(1, 3, 16, 16)),
-            r"want images of shape \[n, 3, \(32, 32\)\]",
+            r"want images of shape \[n, 3, 32, 32\], got \[",
         ),
     ],
 )
