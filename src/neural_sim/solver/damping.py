@@ -201,14 +201,14 @@ class Damping(abc.ABC):
         """Choose lambda for ``matvec`` and the right-hand side ``b``."""
 
     def raised(self, damped: Damped, lowest: float) -> Damped | None:
-        """Raise lambda after a solve met the curvature ``lowest`` < -lambda; None: lambda is fixed."""
+        """Raise lambda after a solve met the undamped curvature ``lowest`` < -lambda; None: lambda is fixed."""
         return None
 
 
 @validated
 @dataclass(frozen=True)
 class FixedDamping(Damping):
-    """A given lambda, for instance 0 where the inner problem's own proximal term bounds its curvature.
+    """A given lambda, for instance 0 where the inner problem's own proximal term makes its Hessian positive definite.
 
     With ``lanczos_steps`` > 0 the spectrum is still estimated, for the log.
     """
