@@ -12,8 +12,8 @@ from neural_sim.configuration import replaced
 from neural_sim.main import UserError, context_of
 from neural_sim.stages.reconstruction import ReconstructionStage
 from neural_sim.stages.scene import LoadedImagesStage, MeshSubjectStage
-from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
 from neural_sim.studies.nerf_vs_mesh import NerfVsMesh
+from neural_sim.studies.sources import graphs_of_seeds
 from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.types import LabelledImages
 
@@ -71,6 +71,21 @@ def test_bad_settings_are_refused_by_name(wrong):
         command(*wrong)
 
 
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+experiment=gumbel_temperature", "parameter=[pose,zoom]"], "want one parameter with bins"),
+        (["+experiment=gumbel_temperature", "gradient=stratified"], "temperatures: want gradient=pathwise"),
+    ],
+    ids=lambda words: words[1] if isinstance(words, list) else "",
+)  # fmt: skip
+def test_what_a_study_cannot_measure_is_refused_before_anything_is_made(overrides, message):
+    run, steps = command(*overrides)
+    with pytest.raises(ValueError, match=message):
+        for step in steps.values():
+            list(step.reads(run))
+
+
 def test_another_method_is_what_its_own_command_would_compose():
     """Apart from ``stages`` and the study's own node, which follow from the experiment."""
     run, _ = command("+experiment=samples_gallery", "baseline=ns", "seed=3")
@@ -101,7 +116,7 @@ def test_nerf_and_mesh_share_all_but_what_is_rendered():
         assert getattr(nerf, name) is getattr(mesh, name)
     assert nerf.seed == 5 and steps["nerf_vs_mesh"].sources(second)["nerf"].seed == 6
     assert steps["nerf_vs_mesh"].sources(second)["mesh"].scene.names == first.names
-    tests = sets_of_kinds(first, {"single": (1, 1), "multiple": (2, 4)})
+    tests = steps["nerf_vs_mesh"].tests(first)
     assert [t.synthesizer.objects_per_image for t in tests.values()] == [(1, 1), (2, 4)]
     assert len(
         {t.key for t in tests.values()}

@@ -1,6 +1,7 @@
 """Bias and variance of estimates held against a truth, and where relaxed draws lie."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -44,18 +45,30 @@ def test_draws_follow_p_at_low_temperatures_and_meet_in_the_middle_at_high_ones(
     torch.testing.assert_close(shares, wanted, rtol=0.0, atol=0.02)
 
 
-def test_estimates_without_derivative_are_biased_by_the_whole_truth(scene):
-    """At a temperature of 1e-4 no draw is near a tie: all of the truth is missed."""
+@pytest.fixture(scope="module")
+def loop(scene):
     psi = torch.tensor([[2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     theta, validation = detector.init(generator), scene.training_set(psi, 3, generator).images
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
     images = scene.training_set(psi, 4, generator).images
-    loop = FrozenLoop.at(State(scene, detector, theta, psi), images, validation, solver, generator)
-    rows, truths = Temperatures((1e-4,), rounds=2, truth_per_bin=4, draws=100).measure(
-        loop, PathwiseEstimator(), 4, seed=0
-    )
+    return FrozenLoop.at(State(scene, detector, theta, psi), images, validation, solver, generator)
+
+
+STUDY = Temperatures((1e-4,), rounds=2, truth_per_bin=4, draws=100)
+
+
+def test_a_derivative_of_zero_is_refused_in_words(loop):
+    """As after a solve that found no v: no error is relative to it."""
+    still = replace(loop, vector={name: torch.zeros_like(value) for name, value in loop.vector.items()})
+    with pytest.raises(ValueError, match=r"temperatures: the derivative of a, b is 0.*adjoint solve: "):
+        STUDY.measure(still, PathwiseEstimator(), 4, seed=0)
+
+
+def test_estimates_without_derivative_are_biased_by_the_whole_truth(loop):
+    """At a temperature of 1e-4 no draw is near a tie: all of the truth is missed."""
+    rows, truths = STUDY.measure(loop, PathwiseEstimator(), 4, seed=0)
     for row, truth in zip(rows, truths, strict=True):
         assert row.object == truth.object and row.spread < 1e-3 * truth.length
         expected = math.sqrt(max(0.0, truth.length**2 - truth.noise**2))

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.report.score_table import ScoreTable, match
-from neural_sim.studies.sources import SideBySide, publish, table
+from neural_sim.studies.sources import Samples, SideBySide, ap_figure, publish, table
 from neural_sim.types import LabelledImages
 
 BOX = torch.tensor([[10.0, 10.0, 30.0, 30.0]])
@@ -68,18 +69,51 @@ def test_the_interval_covers_the_spread_over_images():
 
 
 def test_the_table_and_the_files_have_every_source(context):
-    result, shown = found(20), LabelledImages.concatenate([truth(4)] * 3)
+    result = found(20)
+    shown = Samples({"nerf": 4, "mesh": 4, "other": 9}, LabelledImages.concatenate([truth(4)] * 3))
     text = table(result, "A heading.")
     assert "| single | 48 | 100.0 (100.0 to 100.0) |" in text and "nerf ahead of other by" in text
     assert "| single, mug | 100.0 | 100.0 | 0.0 |" in text
-    assert "| **50.0** (" in text and "Differences in bold exceed the spread." in text
+    assert "| **50.0** (" in text and "Differences are in bold if their interval excludes 0." in text
     one = table(replace(result, seeds=(0,)), "A heading.")
     assert "**" not in one and "bold" not in one and "intervals over test images; seed 0." in one
     run = publish(context, result, shown, ["can", "mug"], "A heading.")
     document = json.loads((context.folder / "study.json").read_text())
+    assert document["training_images"]["other"] == 9
+    assert "first seed: 4 of nerf, 4 of mesh, 9 of other." in (context.folder / "study.md").read_text()
     assert document["ap"]["single"]["other"]["value"] == pytest.approx(0.5)
     assert {path.name for path in (context.folder / "figures").iterdir()} == {
         "ap.png",
         "training_images.png",
     }
     assert MlflowClient(context.uri).get_run(run.run_id).data.metrics["single/mesh/ap"] == pytest.approx(1.0)
+
+
+def test_a_source_of_fewer_images_has_a_row_of_its_own():
+    """A folder of another program may hold fewer images than are shown; every row has as many as the smallest."""
+
+    def source(count, value):
+        images = replace(truth(count), images=torch.full((count, 3, 8, 8), value))
+        return SimpleNamespace(images=lambda results: SimpleNamespace(images=images))
+
+    samples = Samples.of(None, {"nerf": source(20, 0.2), "blenderproc": source(3, 0.7)}, 8)
+    assert samples.counts == {"nerf": 20, "blenderproc": 3}
+    assert samples.shown.images[:, 0, 0, 0].tolist() == pytest.approx([0.2] * 3 + [0.7] * 3)
+
+
+def test_a_class_that_one_seed_does_not_show_has_the_mean_of_the_others():
+    images = truth(8)
+    both = [match(detections(images, [True] * 8), images, label) for label in (0, 1)]
+    cans = images.select(torch.arange(0, 8, 2))
+    one = [match(detections(cans, [False] * 4), cans, label) for label in (0, 1)]
+    scores = ScoreTable.of({"nerf": [both, one]}, ["can", "mug"], 2)
+    assert scores.by_class("nerf") == pytest.approx({"can": 0.5, "mug": 1.0})
+
+
+def test_a_long_heading_stays_in_the_figure():
+    figure = ap_figure(
+        found(2), "Detectors trained on images of fields and of meshes reconstructed from views (sfm)."
+    )
+    figure.draw_without_rendering()
+    title = figure._suptitle.get_window_extent()
+    assert title.x0 >= 0.0 and title.x1 <= figure.bbox.x1

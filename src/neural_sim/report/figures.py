@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,12 @@ def save(figure: Figure, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150, facecolor="white")
     return path
+
+
+def titled(figure: Figure, text: str, fontsize: float = 11.0) -> None:
+    """Write a title above a figure, in as many lines as its width asks for."""
+    letters = int(72.0 * figure.get_figwidth() / (0.6 * fontsize))
+    figure.suptitle(textwrap.fill(text, max(letters, 8)), color=INK, fontsize=fontsize)
 
 
 def psi_figure(learned: Sequence[Learned], title: str) -> Figure:

@@ -20,8 +20,7 @@ from neural_sim.ranges import Fraction, PositiveInt, validated
 from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
-from neural_sim.studies.graphs import Methods, graphs_of_methods
-from neural_sim.tasks.context import Context, Task
+from neural_sim.tasks.context import Context, Methods, Task
 from neural_sim.types import LabelledImages
 
 RIGHT, WRONG, MISSED = "#2ca25f", "#d7301f", "#ffd23f"
@@ -78,12 +77,12 @@ class DetectionGallery(Task):
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
         context.experiment.check_boxes("detection_gallery")
-        graphs = graphs_of_methods(context, self.methods, "detection_gallery.methods")
+        graphs = context.graphs_of(self.methods, "detection_gallery.methods")
         return [context.graph.targets, *(graph.learned for graph in graphs.values())]
 
     @override
     def run(self, context: Context) -> None:
-        graphs = graphs_of_methods(context, self.methods, "detection_gallery.methods")
+        graphs = context.graphs_of(self.methods, "detection_gallery.methods")
         results = context.results
         test = results(context.graph.targets).test
         found = {}

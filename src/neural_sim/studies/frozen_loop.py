@@ -1,4 +1,4 @@
-"""A frozen state of the psi loop (psi, detector and v) for comparing estimators with a reference."""
+"""The psi loop frozen at one psi and detector, with v solved once, for comparing estimators with a reference."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.derivative import image_losses, object_images
 from neural_sim.outer.probing import ProbeSet
-from neural_sim.parameter.factor import BinnedFactor, Factor
+from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.hvp import gradient
 from neural_sim.solver.operator import unflatten
@@ -29,7 +30,7 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class State:
-    """The parts of the psi loop at one moment; ``theta`` has all of the detector's parameters."""
+    """The state of a psi loop; ``theta`` has all of the detector's parameters."""
 
     scene: Scene
     detector: Detector
@@ -42,7 +43,7 @@ class FrozenLoop:
     """The psi loop at one psi and theta, with the adjoint solved once.
 
     ``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta, and
-    ``solve`` describes that solve in words.
+    ``solve`` says in words how the solve for v ended.
     """
 
     scene: Scene
@@ -81,9 +82,8 @@ class FrozenLoop:
         terms = CachedSet.of(detector, backbone, validation).mean_terms()
         adjoint = solver.solve(inner.terms(), trainable, gradient(terms, trainable), None, generator)
         solution = adjoint.solution
-        solve = (
-            f"{solution.status.name.lower()} in {solution.steps} steps at lambda {adjoint.damping.value:.2g}"
-        )
+        ended = solution.status.name.lower().replace("_", " ")
+        solve = f"{ended}, {solution.steps} steps at lambda {adjoint.damping.value:.2g}"
         vector = unflatten(solution.value, trainable)
         return FrozenLoop(scene, detector, backbone, trainable, vector, psi, solve)
 
@@ -93,28 +93,9 @@ class FrozenLoop:
         return replace(self, scene=replace(self.scene, distribution=distribution))
 
     @property
-    def factor(self) -> Factor:
-        """The distribution's only factor.
-
-        Raises:
-            ValueError: the distribution has more than one.
-        """
-        factors = self.scene.distribution.factors
-        if len(factors) != 1:
-            names = [factor.name for factor in factors]
-            raise ValueError(f"parameter: want one parameter to hold estimators against, got {names}")
-        return factors[0]
-
-    @property
     def bins(self) -> BinnedFactor:
-        """The distribution's only factor, which has bins.
-
-        Raises:
-            ValueError: the factor has no bins.
-        """
-        if (self.factor,) != self.scene.distribution.binned:
-            raise ValueError(f"parameter: want one parameter with bins, got {self.factor.name}")
-        return self.scene.distribution.binned[0]
+        """The distribution's only factor, see ``only_bins``."""
+        return only_bins(self.scene.distribution)
 
     def probes(self, per_bin: int, generator: torch.Generator) -> ProbeSet:
         """Draw ``per_bin`` images of every bin of every object."""
@@ -126,18 +107,18 @@ class FrozenLoop:
         return self.over_strata(self.probes(per_bin, generator))
 
     def over_strata(self, probed: ProbeSet) -> list[MixedDerivative]:
-        """Return every object's stratified estimate, from scores <dl/dtheta, v> of its probes in each bin or light."""
+        """Return every object's stratified estimate, from the scores <dl/dtheta, v> of its probes in each bin."""
         return [self._stratified(probed, label) for label in range(len(probed.probes))]
 
     def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
-        probes = probed.probes[label][self.factor.name]
+        probes = probed.probes[label][self.bins.name]
         along = scores(probed.cached.losses, self.trainable, self.vector, probes.index).cpu()
-        return by_strata(along, self.factor, self.psi[label].float())
+        return by_strata(along, self.bins, self.psi[label].float())
 
     def pathwise(
         self, estimator: PathwiseEstimator, count: int, generator: torch.Generator
     ) -> list[MixedDerivative]:
-        """Return every object's estimate from ``count`` relaxed draws of it, through the psi loop's own binding."""
+        """Return every object's estimate from ``count`` relaxed draws of it, made as the psi loop makes them."""
         rendered = self.scene.training_set(self.psi, count, generator, estimator.draws)
         images = rendered.images
         targets = self.detector.assign(images.boxes, images.labels)
@@ -146,6 +127,41 @@ class FrozenLoop:
         weights = torch.full((len(images),), len(rendered.objects) / len(images))
         parts = object_images(self.scene, rendered, self.psi, weights).values()
         return [estimator.estimate(losses, self.trainable, self.vector, part, {}) for part in parts]
+
+
+def only_bins(distribution: SceneDistribution) -> BinnedFactor:
+    """Return the only factor of a distribution.
+
+    Raises:
+        ValueError: it has several factors, or its factor has no bins.
+    """
+    if len(distribution.factors) != 1 or len(distribution.binned) != 1:
+        names = [factor.name for factor in distribution.factors]
+        raise ValueError(f"parameter: want one parameter with bins to compare estimators in, got {names}")
+    return distribution.binned[0]
+
+
+def check_comparable(context: Context, study: str) -> None:
+    """Refuse settings under which a study cannot compare estimators in a frozen loop.
+
+    Raises:
+        ValueError: training includes photographs, or the distribution is not of one factor with bins.
+    """
+    if context.experiment.training.real.combined:
+        raise ValueError(f"{study}: want training.real.mode=none, it trains on synthesised images alone")
+    only_bins(context.experiment.imaging.distribution)
+
+
+def pathwise_of(context: Context, study: str) -> PathwiseEstimator:
+    """Return the run's estimator.
+
+    Raises:
+        ValueError: it is not the pathwise one.
+    """
+    estimator = context.experiment.loop.gradient
+    if not isinstance(estimator, PathwiseEstimator):
+        raise ValueError(f"{study}: want gradient=pathwise, the only estimator that differentiates images")
+    return estimator
 
 
 def centred(derivatives: list[MixedDerivative]) -> Float[Tensor, "objects k"]:

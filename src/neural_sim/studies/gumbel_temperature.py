@@ -25,7 +25,7 @@ from neural_sim.report import figures
 from neural_sim.report.figures import INK, METHOD_COLOURS, MUTED
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
-from neural_sim.studies.frozen_loop import FrozenLoop, centred
+from neural_sim.studies.frozen_loop import FrozenLoop, centred, check_comparable, pathwise_of
 from neural_sim.tasks.context import Context, Task
 
 BIAS, SPREAD = METHOD_COLOURS["learned"], "#e08a1e"
@@ -35,12 +35,17 @@ LEAST = 1e-2
 
 @dataclass(frozen=True)
 class AtTemperature:
-    """One object at one temperature; all rows of a study share their noise.
+    """One object at one temperature; all temperatures use the same noise.
 
-    ``frequencies`` are the fractions of the relaxed draws in each bin. ``bias`` is |mean estimate - truth| in centred
-    logits, after subtracting the variance of both (0 where that is larger), ``bias_error`` its standard error.
-    ``spread`` is the square root of the variance, summed over components, of an estimate from ``images`` images.
-    ``cosine`` is the cosine between the mean estimate and the truth.
+    Attributes:
+        object: the object's name.
+        temperature: the temperature tau.
+        frequencies: fraction of the relaxed draws in each bin.
+        bias: |mean estimate - truth| in centred logits, corrected for the variances of both; 0 if these are larger.
+        bias_error: standard error of ``bias``.
+        spread: square root of one estimate's variance, summed over components.
+        cosine: cosine between the mean estimate and the truth.
+        images: number of images per estimate.
     """
 
     object: str
@@ -57,8 +62,12 @@ class AtTemperature:
 class Truth:
     """One object's derivative over hard bins.
 
-    ``length`` is its norm, ``noise`` its standard error, ``spread`` the stratified estimator's with as many images as a
-    row of ``AtTemperature``. ``probabilities`` are p, the expected frequencies of draws.
+    Attributes:
+        object: the object's name.
+        length: norm of the derivative.
+        noise: standard error of the derivative, as a norm.
+        spread: the stratified estimator's spread with as many images as the estimates have.
+        probabilities: p, the frequencies that draws should have.
     """
 
     object: str
@@ -87,25 +96,26 @@ class Temperatures(Task):
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
-        _estimator(context)
-        if context.experiment.training.real.combined:
-            raise ValueError(
-                "temperatures: want training.real.mode=none, their problem has synthesised images only"
-            )
+        pathwise_of(context, "temperatures")
+        check_comparable(context, "temperatures")
         return [context.graph.warm_start, context.graph.targets]
 
     @override
     def run(self, context: Context) -> None:
         seed, images = context.experiment.run.seed, context.experiment.loop.outer.images_per_object
         loop = FrozenLoop.of(context, seed)
-        rows, truths = self.measure(loop, _estimator(context), images, seed)
-        print(f"v {loop.solve}")
+        rows, truths = self.measure(loop, pathwise_of(context, "temperatures"), images, seed)
+        print(f"adjoint solve: {loop.solve}")
         publish(context, rows, truths)
 
     def measure(
         self, loop: FrozenLoop, estimator: PathwiseEstimator, images: int, seed: int
     ) -> tuple[list[AtTemperature], list[Truth]]:
-        """Compare estimates from ``images`` images at every temperature with the reference, object by object."""
+        """Compare estimates from ``images`` images at every temperature with the reference, object by object.
+
+        Raises:
+            ValueError: the reference of an object is 0, so that no error can be relative to it.
+        """
         names, bins = loop.scene.names, loop.bins.bins
         hard = loop.truth(self.truth_per_bin, torch.Generator().manual_seed(seed))
         truth, errors = centred(hard), torch.stack([part.standard_error for part in hard])
@@ -119,6 +129,11 @@ class Temperatures(Task):
             )
             for label, name in enumerate(names)
         ]
+        if flat := [each.object for each in truths if each.length == 0.0]:
+            raise ValueError(
+                f"temperatures: the derivative of {', '.join(flat)} is 0, which has no direction to compare "
+                f"estimates with (adjoint solve: {loop.solve})"
+            )
         rows = []
         for value in self.values:
             moved = loop.with_factor(replace(loop.bins, temperature=value))
@@ -133,22 +148,15 @@ class Temperatures(Task):
         return rows, truths
 
 
-def _estimator(context: Context) -> PathwiseEstimator:
-    estimator = context.experiment.loop.gradient
-    if not isinstance(estimator, PathwiseEstimator):
-        raise ValueError("temperatures: want gradient=pathwise, no other estimator relaxes its draws")
-    return estimator
-
-
 def against(
     estimates: Float[Tensor, "rounds k"], truth: Float[Tensor, "k"], truth_errors: Float[Tensor, "k"]
 ) -> tuple[float, float, float, float]:
-    """Return bias, its standard error, spread and cosine of independent estimates, see ``AtTemperature``."""
+    """Return bias, standard error of the bias, spread and cosine of independent estimates, see ``AtTemperature``."""
     mean, variance = estimates.mean(0), estimates.var(0)
     off = mean - truth
     noise = variance / len(estimates) + truth_errors.square()
     bias = math.sqrt(max(0.0, float(off.square().sum() - noise.sum())))
-    # The error of |off| is the noise along off or, if no bias is measurable, all of the noise.
+    # The error of |off| is the noise in its direction or, if no bias is measurable, all of the noise.
     along = float((off.square() * noise).sum().sqrt() / off.norm().clamp_min(1e-30))
     error = along if bias > 0.0 else float(noise.sum().sqrt())
     cosine = float(mean @ truth / (mean.norm() * truth.norm()).clamp_min(1e-30))
@@ -156,7 +164,7 @@ def against(
 
 
 def bin_frequencies(factor: BinnedFactor, psi: Float[Tensor, "k"], draws: int, seed: int) -> list[float]:
-    """Return the fraction of relaxed draws in each bin; every draw mixes the middles of the bins."""
+    """Return the fraction of relaxed draws in each bin; a draw mixes the centres of the bins."""
     generator = torch.Generator().manual_seed(seed)
     noise = BinNoise(gumbel((draws, factor.bins), generator, torch.float64))
     middle = torch.full((draws,), 0.5, dtype=torch.float64)
@@ -184,14 +192,14 @@ def publish(context: Context, rows: Sequence[AtTemperature], truths: Sequence[Tr
 def table(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> str:
     """Return Markdown with errors relative to the norm of the reference."""
     parts = [
-        f"Estimates of d/dpsi <dL_train/dtheta, v> from {rows[0].images} images, in lengths of the derivative over "
-        "hard bins."
+        f"Estimates of d/dpsi <dL_train/dtheta, v> from {rows[0].images} images each. Bias and spread are divided by "
+        "the norm of the derivative over hard bins."
     ]
-    head = ["temperature", "bias", "spread", "cosine of the mean", "draws where p puts them"]
+    head = ["temperature", "bias", "spread", "cosine of the mean", "overlap of draws and p"]
     for truth in truths:
         parts.append(
-            f"**{truth.object}**: truth {truth.length:.2g}, known to {truth.noise / truth.length:.0%}; the stratified "
-            f"estimator's spread is {truth.spread / truth.length:.2f}."
+            f"**{truth.object}**: norm over hard bins {truth.length:.2g}, known to {truth.noise / truth.length:.0%}; "
+            f"the stratified estimator has a spread of {truth.spread / truth.length:.2f}."
         )
         cells = [
             (
@@ -221,8 +229,8 @@ def temperature_figure(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -
         own = [row for row in rows if row.object == truth.object]
         _draw_frequencies(grid[0, column], own, truth)
         _draw_errors(grid[1, column], own, truth)
-    grid[1, 0].set_ylabel("in lengths of the derivative", color=INK, fontsize=8)
-    title = f"Gumbel-softmax: relaxed draws, and the derivative from {rows[0].images} of them"
+    grid[1, 0].set_ylabel("relative to the derivative over hard bins", color=INK, fontsize=8)
+    title = f"Gumbel-softmax: relaxed draws, and derivatives from {rows[0].images} of them"
     figure.suptitle(title, color=INK, fontsize=11)
     handles, labels = grid[1, 0].get_legend_handles_labels()
     figure.legend(
@@ -257,7 +265,7 @@ def _draw_errors(axes: Any, rows: Sequence[AtTemperature], truth: Truth) -> None
     axes.errorbar(
         at, np.maximum(bias, LEAST), yerr=reach, fmt="s", color=BIAS, markersize=4, capsize=2, label="bias"
     )
-    axes.axhline(1.0, color=INK, linewidth=0.8, linestyle="--", label="the derivative over hard bins itself")
+    axes.axhline(1.0, color=INK, linewidth=0.8, linestyle="--", label="norm of the derivative over hard bins")
     stratified = truth.spread / truth.length
     axes.axhline(
         stratified, color=MUTED, linewidth=0.8, linestyle=":", label="spread of the stratified estimator"

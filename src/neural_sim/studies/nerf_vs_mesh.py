@@ -1,4 +1,4 @@
-"""Fields against the mesh renderer as a source of training images (the paper's Sec. 4.1 and A.2)."""
+"""Fields against the mesh renderer as sources of training images (the paper's Secs. 4.1 and A.2)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from neural_sim.stages.graph import Graph
 from neural_sim.stages.scene import LoadedImagesStage, MeshSubjectStage
 from neural_sim.stages.stage import Stage
 from neural_sim.stages.target_sets import TargetSetsStage
-from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
-from neural_sim.studies.sources import compare_sources, publish, training_images
+from neural_sim.studies.sources import Samples, compare_sources, graphs_of_seeds, publish
 from neural_sim.target.coco import CocoTarget
 from neural_sim.tasks.context import Context, Task
 
 ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
-"""Where BlenderProc's ``write_coco_annotations`` writes, in its output folder."""
+"""Files in an output folder that BlenderProc's ``write_coco_annotations`` may have written."""
 
 
 @validated
@@ -32,19 +31,18 @@ ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
 class NerfVsMesh(Task):
     """``+experiment=nerf_vs_mesh``: compare detectors trained on images of fields and on images of meshes.
 
-    Both kinds of images have the same poses and distances. All detectors are scored on images of one and of several
-    objects.
+    Both sources render the same poses and distances. All detectors are scored on images of one and of several objects.
 
     Args:
         single: fewest and most objects per image in the first test set.
         multiple: fewest and most objects per image in the second test set.
-        seeds: number of detectors of each kind; seeds count up from the run's.
-        blenderproc: folder of COCO output by BlenderProc, which replaces the images of the mesh renderer; None: the
+        seeds: number of detectors of each source; seeds count up from the run's.
+        blenderproc: folder with BlenderProc's COCO output, whose images replace those of the mesh renderer; None: the
             mesh renderer.
-        categories: category names of BlenderProc -> object names, null to leave a category out. Categories not listed
-            are objects of the same name.
+        categories: object name by BlenderProc's category name, null to leave the category out. A category that is not
+            listed is the object of the same name.
         draws: bootstrap draws over test images.
-        shown: number of training images of each kind in the figure.
+        shown: number of training images of each source in the figure.
 
     Raises:
         ValueError: the folder has no BlenderProc annotations.
@@ -69,7 +67,7 @@ class NerfVsMesh(Task):
         found = [folder / name for name in ANNOTATIONS if (folder / name).is_file()]
         if not found:
             raise ValueError(
-                f"nerf_vs_mesh.blenderproc: want the folder that BlenderProc's write_coco_annotations wrote, no "
+                f"nerf_vs_mesh.blenderproc: want a folder that BlenderProc's write_coco_annotations wrote; no "
                 f"{' or '.join(ANNOTATIONS)} in {folder}"
             )
         return CocoTarget(found[0], categories=self.categories)
@@ -77,9 +75,9 @@ class NerfVsMesh(Task):
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
         if not context.graph.objects.has_meshes:
-            raise ValueError("nerf_vs_mesh: want objects with meshes, objects=photos has none")
+            raise ValueError("nerf_vs_mesh: want objects with meshes; objects=photos has none")
         if not context.experiment.imaging.target.renders:
-            raise ValueError("nerf_vs_mesh: want target=rendered, its test images are rendered from meshes")
+            raise ValueError("nerf_vs_mesh: want target=rendered; its test images are renders of meshes")
         for graph in graphs_of_seeds(context, self.seeds):
             yield from self.tests(graph).values()
             yield from self.sources(graph).values()
@@ -88,17 +86,18 @@ class NerfVsMesh(Task):
     def run(self, context: Context) -> None:
         graphs, results = graphs_of_seeds(context, self.seeds), context.results
         found = compare_sources(graphs, results, self.sources, self.tests, self.draws)
-        first, names = graphs[0], list(context.graph.names)
-        drawn = self.sources(first)["nerf"].images(results)
-        write_training_set(drawn, names, context.folder / "training_set")
-        shown = training_images(first, results, self.sources(first), self.shown)
-        other = found.sources[1]
-        heading = f"Detectors trained on images of fields (nerf) and of meshes ({other})."
-        publish(context, found, shown, names, heading)
+        sources, names = self.sources(graphs[0]), list(context.graph.names)
+        write_training_set(sources["nerf"].images(results), names, context.folder / "training_set")
+        heading = f"Detectors trained on images of fields (nerf) and of meshes ({found.sources[1]})."
+        publish(context, found, Samples.of(results, sources, self.shown), names, heading)
 
     def tests(self, graph: Graph) -> dict[str, TargetSetsStage]:
         """Return the test sets by name."""
-        return sets_of_kinds(graph, {"single": self.single, "multiple": self.multiple})
+        synthesis = graph.experiment.imaging.synthesis
+        return {
+            name: replace(graph.targets, synthesizer=replace(synthesis, objects_per_image=count))
+            for name, count in (("single", self.single), ("multiple", self.multiple))
+        }
 
     def sources(self, graph: Graph) -> dict[str, DetectorStage]:
         """Return the detectors to compare, by the source of their training images."""

@@ -24,7 +24,7 @@ from neural_sim.parameter.product import HARD
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
-from neural_sim.studies.frozen_loop import FrozenLoop
+from neural_sim.studies.frozen_loop import FrozenLoop, pathwise_of
 from neural_sim.synthesis.assembly import RenderedObject, one_each
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import Maps
@@ -40,13 +40,13 @@ class PatchCost:
         object: the object's name.
         method: forward or reverse mode, and the patch.
         patch: rays per patch; None in forward mode.
-        gradient_mb: peak memory of the renderer's derivative in MiB; in forward mode of the render that computes it,
-            without the maps and their derivatives.
+        gradient_mb: peak memory of the renderer's derivative in MiB. In forward mode, that of the render that computes
+            it, without the maps and their derivatives.
         total_mb: peak memory in MiB of the whole estimate from one image of every object: rendering, the loss's
             derivative with respect to the images, the renderer's derivative.
-        milliseconds: wall time of rendering and the renderer's derivative.
-        cpu_milliseconds: processor time of all cores for the same.
-        difference: distance from the result of forward mode, relative to the latter's norm.
+        milliseconds: wall-clock time of the render and the renderer's derivative.
+        cpu_milliseconds: CPU time of all cores for the same.
+        difference: |derivative - that of forward mode| / |that of forward mode|.
     """
 
     object: str
@@ -62,12 +62,11 @@ class PatchCost:
 @validated
 @dataclass(frozen=True)
 class PatchMemory(Task):
-    """``+experiment=patch_memory``: measure memory and time of the renderer's derivative.
-
-    It is taken in reverse mode with several patch sizes, and in forward mode.
+    """``+experiment=patch_memory``: measure memory and time of the renderer's derivative, by mode and patch size.
 
     Args:
-        patches: patch sizes in rays, for reverse mode.
+        patches: patch sizes in rays, for reverse mode. Those of at least a whole image are left out, because the whole
+            image is always measured.
         repeats: number of timings; their median is reported.
     """
 
@@ -76,13 +75,14 @@ class PatchMemory(Task):
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
-        _estimator(context)
+        pathwise_of(context, "patch_memory")
         return [context.graph.warm_start, context.graph.targets]
 
     @override
     def run(self, context: Context) -> None:
         x = context.experiment
-        rows = self.measure(FrozenLoop.of(context, x.run.seed), _estimator(context), x.run.seed)
+        estimator = pathwise_of(context, "patch_memory")
+        rows = self.measure(FrozenLoop.of(context, x.run.seed), estimator, x.run.seed)
         camera, field = context.graph.camera, type(context.results(context.graph.fields[0]).field).__name__
         rays = x.imaging.renderer.rays_per_chunk
         setting = f"{field}, {camera.width} x {camera.height} pixels, {rays} rays per chunk"
@@ -127,18 +127,9 @@ class PatchMemory(Task):
         return 1e3 * statistics.median(wall), 1e3 * statistics.median(worked)
 
 
-def _estimator(context: Context) -> PathwiseEstimator:
-    estimator = context.experiment.loop.gradient
-    if not isinstance(estimator, PathwiseEstimator):
-        raise ValueError(
-            "patch_memory: want gradient=pathwise, no other estimator differentiates the renderer"
-        )
-    return estimator
-
-
 @dataclass(frozen=True)
 class _Image:
-    """One image of one object with the cotangent of its maps; each render repeats the same draw."""
+    """One image of one object, and the cotangent of its maps; every render repeats the same draw."""
 
     loop: FrozenLoop
     label: int
@@ -164,7 +155,6 @@ class _Image:
         return self.cotangents.rgb.device
 
     def peak(self, run: Callable[[], object]) -> float:
-        """Return the peak memory of ``run`` in MiB."""
         return peak_bytes(run, self.device) / 2**20
 
     def render(self, tangents: bool) -> RenderedObject:
@@ -181,7 +171,7 @@ class _Image:
         return draw_cotangents(field.render_rays, scene.camera, draw, self.cotangents, patch)
 
     def output_mb(self) -> float:
-        """Return MiB of the maps and their derivatives, each as large as the cotangents."""
+        """Return MiB of the maps and of each derivative of them, which is as large as they are."""
         maps = (self.cotangents.rgb, self.cotangents.opacity)
         each = sum(values.numel() * values.element_size() for values in maps)
         return each * (1 + len(self.forward())) / 2**20
@@ -192,7 +182,7 @@ def _generator(seed: int) -> torch.Generator:
 
 
 def _apart(values: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> float:
-    """Return the distance between two derivatives, relative to the norm of ``truth``."""
+    """Return |values - truth| / |truth|."""
     one, other = (torch.cat([each[name] for name in truth]) for each in (values, truth))
     return float((one - other).norm() / other.norm())
 
@@ -213,8 +203,8 @@ def table(rows: Sequence[PatchCost], setting: str) -> str:
     """Return Markdown with one table per object."""
     parts = [
         f"Derivative of one image with respect to the scene parameters that depend on psi ({setting}). *Gradient* is "
-        "the working memory of the renderer's derivative, *total* that of the whole estimate with the detector's, from "
-        "one image of every object."
+        "the working memory of the renderer's derivative; *total* is the peak memory of the whole estimate, including "
+        "the detector's derivatives, from one image of every object."
     ]
     head = ["method", "gradient, MiB", "total, MiB", "ms", "CPU ms", "relative difference from forward"]
     for name in dict.fromkeys(row.object for row in rows):

@@ -18,8 +18,7 @@ from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
 from neural_sim.stages.graph import Graph, Psi
 from neural_sim.stages.stage import Results, Stage
-from neural_sim.studies.graphs import Methods, graphs_of_methods
-from neural_sim.tasks.context import Context, Task
+from neural_sim.tasks.context import Context, Methods, Task
 from neural_sim.types import LabelledImages
 
 
@@ -59,7 +58,7 @@ class SamplesGallery(Task):
         names, known = self._names(context), context.graph.names
         if not names or set(names) - set(known):
             raise ValueError(f"samples_gallery.objects: want some of {list(known)}, got {list(names)}")
-        graphs = graphs_of_methods(context, self.methods, "samples_gallery.methods")
+        graphs = context.graphs_of(self.methods, "samples_gallery.methods")
         return [context.graph.targets, *(graph.learned for graph in graphs.values())]
 
     def _names(self, context: Context) -> tuple[str, ...]:
@@ -68,7 +67,7 @@ class SamplesGallery(Task):
     @override
     def run(self, context: Context) -> None:
         graph, names = context.graph, self._names(context)
-        graphs = graphs_of_methods(context, self.methods, "samples_gallery.methods")
+        graphs = context.graphs_of(self.methods, "samples_gallery.methods")
         results = context.results
         learned = {method: results(other.learned).last for method, other in graphs.items()}
         drawn = {method: self._drawn(graphs[method], results, psi) for method, psi in learned.items()}
@@ -132,10 +131,7 @@ def table(samples: Sequence[Samples]) -> str:
     """Return a Markdown table of distances by object and factor."""
     methods = list(samples[0].images)
     rows = [
-        [
-            f"{each.object}, {factor}",
-            *(f"{(each.distances[method] or {})[factor]:.2f}" for method in methods),
-        ]
+        [f"{each.object}, {factor}", *(f"{(each.distances[method] or {})[factor]:.2f}" for method in methods)]
         for each in samples
         for factor in dict.fromkeys(factor for known in each.distances.values() for factor in known or {})
     ]

@@ -21,13 +21,12 @@ from neural_sim.field.scores import compare, where_known
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.views import choose_mesh_renderer
-from neural_sim.report.figures import INK
+from neural_sim.report.figures import INK, titled
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.reconstruction import ReconstructionStage, ReconstructionSubjectStage
 from neural_sim.stages.stage import Results, Stage
-from neural_sim.studies.graphs import graphs_of_seeds
-from neural_sim.studies.sources import More, compare_sources, publish, training_images
+from neural_sim.studies.sources import More, Samples, compare_sources, graphs_of_seeds, publish
 from neural_sim.synthesis.subjects import PhotographedField, RenderedSubject
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PosedViews
@@ -38,10 +37,10 @@ UNLIT = Lighting(lights=(), ambient=1.0)
 
 @dataclass(frozen=True)
 class HeldOut:
-    """One object in views that neither its field nor its reconstruction has seen.
+    """One object in views that neither its field nor its reconstruction was made from.
 
-    ``images`` are the first such view itself (``view``) and its renders by each source, over white; ``scores`` are the
-    ``psnr``, ``psnr_foreground`` (dB) and ``ssim`` of each source over all these views.
+    ``images`` are the first of these views (``view``) and the renders of it by each source, over white. ``scores`` are
+    the ``psnr``, ``psnr_foreground`` (dB) and ``ssim`` of each source over all of them.
     """
 
     object: str
@@ -56,9 +55,9 @@ class SfmVsNerf(Task):
 
     Args:
         resolution: cells of the reconstruction along the diameter of the unit sphere.
-        seeds: number of detectors of each kind; seeds count up from the run's.
+        seeds: number of detectors of each source; seeds count up from the run's.
         draws: bootstrap draws over test images.
-        shown: number of training images of each kind in the figure.
+        shown: number of training images of each source in the figure.
     """
 
     resolution: Resolution = 128
@@ -100,17 +99,17 @@ class SfmVsNerf(Task):
             return self._sources(graph, meshes)
 
         found = compare_sources(graphs, results, sources, lambda graph: {"test": graph.targets}, self.draws)
-        shown = training_images(graphs[0], results, sources(graphs[0]), self.shown)
+        samples = Samples.of(results, sources(graphs[0]), self.shown)
         heading = "Detectors trained on images of fields (nerf) and of meshes reconstructed from the same views (sfm)."
         more = More(
             {"held_out": {each.object: dict(each.scores) for each in objects}},
             held_out_table(objects),
             {"held_out": held_out_figure(objects)},
         )
-        publish(context, found, shown, names, heading, more)
+        publish(context, found, samples, names, heading, more)
 
     def _held_out(self, graph: Graph, results: Results, label: int, mesh: RenderedSubject) -> HeldOut:
-        """Render the held-out views of an object by its field and by its reconstruction, and score them."""
+        """Render an object's held-out views with its field and with its reconstruction, and score the renders."""
         views = results(graph.views[label])
         unseen = views.select(torch.arange(len(views) - graph.views[label].held_out, len(views)))
         renderer = graph.experiment.imaging.renderer
@@ -127,7 +126,7 @@ def _as_seen(subject: RenderedSubject, views: PosedViews) -> Float[Tensor, "view
 
 
 def held_out_table(objects: Sequence[HeldOut]) -> str:
-    """Return a Markdown table of the PSNR of whole images and of the object's pixels, by object and on average."""
+    """Return a Markdown table of PSNR by object, and its mean, for whole images and for the object's pixels."""
     sources = list(objects[0].scores)
     rows = {
         each.object: [each.scores[s][key] for s in sources for key in ("psnr", "psnr_foreground")]
@@ -136,12 +135,12 @@ def held_out_table(objects: Sequence[HeldOut]) -> str:
     rows["mean"] = np.mean(list(rows.values()), 0).tolist()
     head = ["object", *(name for source in sources for name in (source, f"{source}, object"))]
     cells = [[name, *(f"{value:.1f}" for value in row)] for name, row in rows.items()]
-    note = "PSNR in dB on held-out views: of whole images over white, and of the object's pixels only."
+    note = "PSNR in dB on held-out views, of whole images over white and of the object's pixels alone."
     return f"{note}\n\n{markdown_table(head, cells)}"
 
 
 def held_out_figure(objects: Sequence[HeldOut]) -> Figure:
-    """Draw one column per object, with a row for its view and one for each source."""
+    """Draw one column per object, with its view in the first row and one row for each source below."""
     rows = list(objects[0].images)
     figure = Figure(figsize=(1.6 * len(objects) + 0.5, 1.75 * len(rows) + 0.5), layout="constrained")
     grid = figure.subplots(len(rows), len(objects), squeeze=False)
@@ -157,5 +156,5 @@ def held_out_figure(objects: Sequence[HeldOut]) -> Figure:
         grid[0, column].set_title(each.object, color=INK, fontsize=9)
     for line, name in enumerate(rows):
         grid[line, 0].set_ylabel(name, color=INK, fontsize=9)
-    figure.suptitle("A held-out view; PSNR over all of them", color=INK, fontsize=11)
+    titled(figure, "One held-out view of each object; PSNR over all of them")
     return figure

@@ -1,10 +1,10 @@
-"""AP of detectors trained on images from several sources, paired by seed; shared by nerf_vs_mesh and sfm_vs_nerf."""
+"""AP of detectors that were trained on images from different sources, for nerf_vs_mesh and sfm_vs_nerf."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,9 +33,9 @@ class SideBySide:
         sources: names of the sources of training images.
         seeds: seeds of the detectors.
         images: number of test images, over all seeds.
-        ap: mean AP of each source over classes and seeds.
-        ahead: lead of the first source over each other source.
-        per_class: AP of each source by class, mean over seeds.
+        ap: AP of each source, the mean over classes and seeds.
+        ahead: lead of the first source over each other one.
+        per_class: AP of each source by class, the mean over seeds.
     """
 
     sources: tuple[str, ...]
@@ -59,6 +59,17 @@ class SideBySide:
         )
 
 
+def graphs_of_seeds(context: Context, seeds: int) -> list[Graph]:
+    """Return the stages of the experiment for the run's seed and the following ones.
+
+    Raises:
+        ValueError: the task is not detection.
+    """
+    x = context.experiment
+    x.check_boxes("a comparison of sources of images")
+    return [Graph(replace(x, run=replace(x.run, seed=x.run.seed + i))) for i in range(seeds)]
+
+
 def compare_sources(
     graphs: list[Graph],
     results: Results,
@@ -73,8 +84,8 @@ def compare_sources(
     Args:
         graphs: one graph per seed.
         results: results of stages.
-        sources: returns the detectors of a graph, by the source of their images.
-        tests: returns the target sets of a graph, by kind.
+        sources: returns the detectors of a graph, by the source of their training images.
+        tests: returns the target sets of a graph, by name.
         draws: bootstrap draws over test images.
     """
     outcomes: dict[str, dict[str, list[list[Outcomes]]]] = {}
@@ -92,24 +103,41 @@ def compare_sources(
     return SideBySide.of(tables, [graph.experiment.run.seed for graph in graphs], images)
 
 
-def training_images(
-    graph: Graph, results: Results, sources: Mapping[str, DetectorStage], count: int
-) -> LabelledImages:
-    """Return ``count`` evenly spaced training images of every source, source by source.
+@dataclass(frozen=True)
+class Samples:
+    """Training images of every source: how many there are, and some of them for a figure.
 
-    If the sources share their draws, the images show the same scenes.
+    Attributes:
+        counts: number of training images by source.
+        shown: equally many of every source, source by source.
     """
-    parts = []
-    for stage in sources.values():
-        images = stage.images(results).images.to("cpu")
-        rows = torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
-        parts.append(images.select(rows))
-    return LabelledImages.concatenate(parts)
+
+    counts: Mapping[str, int]
+    shown: LabelledImages
+
+    @staticmethod
+    def of(results: Results, sources: Mapping[str, DetectorStage], most: int) -> Samples:
+        """Choose ``most`` evenly spaced images of every source, or as many as the smallest one has.
+
+        If the sources share their draws, the images show the same scenes.
+        """
+        counts, parts = {}, []
+        for name, stage in sources.items():
+            images = stage.images(results).images.to("cpu")
+            counts[name] = len(images)
+            parts.append(_spaced(images, most))
+        fewest = min(len(part) for part in parts)
+        return Samples(counts, LabelledImages.concatenate([_spaced(part, fewest) for part in parts]))
+
+
+def _spaced(images: LabelledImages, most: int) -> LabelledImages:
+    rows = torch.linspace(0, len(images) - 1, min(most, len(images))).round().long()
+    return images.select(rows)
 
 
 @dataclass(frozen=True)
 class More:
-    """Tables and figures that a study adds to those of its sources."""
+    """What a study adds to the document, the text and the figures."""
 
     document: Mapping[str, object] = dataclasses.field(default_factory=dict)
     text: str = ""
@@ -119,7 +147,7 @@ class More:
 def publish(
     context: Context,
     found: SideBySide,
-    shown: LabelledImages,
+    samples: Samples,
     classes: Sequence[str],
     heading: str,
     more: More | None = None,
@@ -129,16 +157,17 @@ def publish(
     Args:
         context: context of the study.
         found: the scores.
-        shown: training images of every source, source by source.
+        samples: training images of every source.
         classes: names of the classes.
         heading: sentence that introduces the sources.
         more: further tables and figures.
     """
     more = more or More()
     rows = "; ".join(f"row {i + 1}: {source}" for i, source in enumerate(found.sources))
-    grid = figures.image_grid(
-        shown, classes, len(shown) // len(found.sources), title=f"Training images, {rows}"
-    )
+    columns = len(samples.shown) // len(found.sources)
+    grid = figures.image_grid(samples.shown, classes, columns, title=f"Training images, {rows}")
+    numbers = ", ".join(f"{count} of {source}" for source, count in samples.counts.items())
+    parts = [table(found, f"{heading} Training images with the first seed: {numbers}."), more.text]
     metrics = {
         f"{kind}/{source}/ap": estimate.value
         for kind, row in found.ap.items()
@@ -146,24 +175,24 @@ def publish(
     }
     return context.publish(
         context.config["name"],
-        {**dataclasses.asdict(found), **more.document},
-        "\n\n".join(part for part in (table(found, heading), more.text) if part),
+        {**dataclasses.asdict(found), "training_images": samples.counts, **more.document},
+        "\n\n".join(part for part in parts if part),
         {"ap": ap_figure(found, heading), **more.figures, "training_images": grid},
         metrics,
     )
 
 
 def table(found: SideBySide, heading: str) -> str:
-    """Return Markdown tables of AP by test set, with the leads of the first source, and of AP by class."""
+    """Return Markdown tables of AP by test set, with the first source's leads, and of AP by class."""
     first, *others = found.sources
     several = len(found.seeds) > 1
     over = "seeds and test images" if several else "test images"
     introduction = (
-        f"{heading} AP (0.50 to 0.95) in points, mean of all classes, with 95 % intervals over {over}; "
+        f"{heading} AP (0.50 to 0.95) in points, the mean over classes, with 95 % intervals over {over}; "
         f"seed{'s' if several else ''} {', '.join(map(str, found.seeds))}."
-        + (" Differences in bold exceed the spread." if several else "")
+        + (" Differences are in bold if their interval excludes 0." if several else "")
     )
-    head = ["test images", "number", *found.sources, *(f"{first} ahead of {other} by" for other in others)]
+    head = ["test set", "images", *found.sources, *(f"{first} ahead of {other} by" for other in others)]
     rows = [
         [kind, found.images[kind]]
         + [points(row[source]) for source in found.sources]
@@ -175,15 +204,12 @@ def table(found: SideBySide, heading: str) -> str:
         for kind, by_source in found.per_class.items()
         for name in by_source[first]
     ]
-    tables = [
-        markdown_table(head, rows),
-        markdown_table(["test images, class", *found.sources], by_class),
-    ]
+    tables = [markdown_table(head, rows), markdown_table(["test set, class", *found.sources], by_class)]
     return "\n\n".join([introduction, *tables])
 
 
 def ap_figure(found: SideBySide, title: str) -> Figure:
-    """Draw one group of bars per test set and one bar per source, with intervals."""
+    """Draw a group of bars per test set, with one bar and its interval per source."""
     kinds = list(found.ap)
     figure = Figure(figsize=(1.9 * len(kinds) + 3.2, 3.2), layout="constrained")
     axes = figure.add_subplot()
@@ -200,7 +226,7 @@ def ap_figure(found: SideBySide, title: str) -> Figure:
             axes.text(at, value + max(above, 0.0) + 1.5, f"{value:.1f}", ha="center", fontsize=8, color=INK)
     axes.set_xticks(range(len(kinds)), kinds)
     axes.set(ylabel="AP on the test images (%)", ylim=(0, 105))
-    axes.set_title(title, color=INK, fontsize=10)
+    figures.titled(figure, title, 10)
     axes.yaxis.grid(color=GRID)
     axes.set_axisbelow(True)
     figures.style(axes)

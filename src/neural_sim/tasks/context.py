@@ -11,13 +11,15 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+from annotated_types import MinLen
 from tqdm import tqdm
 
 from neural_sim.configuration import UserError
 from neural_sim.documents import write_json, write_whole
 from neural_sim.outer.records import IterationRecord
+from neural_sim.ranges import Distinct
 from neural_sim.report import figures as drawing
 from neural_sim.report.figures import Figure
 from neural_sim.report.run_tracking import LiveRun, live_run
@@ -31,6 +33,8 @@ from neural_sim.stages.together import make_together
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
+Methods = Annotated[Sequence[str], MinLen(1), Distinct()]
+"""Names of methods, as in ``baseline=...``."""
 
 
 class TaskFailure(RuntimeError):
@@ -103,6 +107,16 @@ class Context:
     def graph(self) -> Graph:
         """The experiment's stages."""
         return Graph(self.experiment, self._iteration)
+
+    def graphs_of(self, methods: Sequence[str], key: str) -> dict[str, Graph]:
+        """Return the stages of the same command with each method.
+
+        Raises:
+            ValueError: a method is unknown, or the context cannot compose; the message names the setting ``key``.
+        """
+        if self.of_method is None:
+            raise ValueError(f"{key}: this context composes no other method's configuration")
+        return {method: Graph(self.of_method(method)) for method in methods}
 
     @cached_property
     def results(self) -> Results:

@@ -34,11 +34,7 @@ from neural_sim.studies.stress.cases import (
 
 SIZE = 24
 UNTRUSTED = tuple(status for status in Status if status is not Status.CONVERGED)
-SOLVERS: dict[str, LinearSolver] = {
-    "cg": ConjugateGradient(),
-    "minres": MinimumResidual(),
-    "exact": Exact(),
-}
+SOLVERS: dict[str, LinearSolver] = {"cg": ConjugateGradient(), "minres": MinimumResidual(), "exact": Exact()}
 ALL = {**SOLVERS, "identity": Identity()}
 
 
