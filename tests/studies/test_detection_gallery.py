@@ -7,10 +7,9 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.detector.metrics import AveragePrecision
+from neural_sim.stages.evaluate import Scores
 from neural_sim.studies.detection_gallery import (
-    Counts,
     DetectionGallery,
-    Found,
     count,
     detections_figure,
     judge,
@@ -74,7 +73,9 @@ def gallery():
 def test_counts_are_over_all_images_and_padding_is_no_box():
     test, found = gallery()
     counts = {method: count(judged(every, test, 0.3, 0.5)) for method, every in found.items()}
-    assert counts == {"ns": Counts(0, 3, 5), "neural_sim": Counts(2, 1, 3)}
+    assert counts == {
+        "ns": {"right": 0, "wrong": 3, "missed": 5}, "neural_sim": {"right": 2, "wrong": 1, "missed": 3}
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("box", [(0.0, 10.0, 9.0, 30.0), (71.0, 10.0, 80.0, 30.0), (60.0, 1.0, 80.0, 30.0)])
@@ -94,7 +95,7 @@ def test_a_caption_stays_in_its_image(box):
 def test_the_files_and_the_run_have_every_method(context):
     test, found = gallery()
     ap = AveragePrecision(0.25, 0.5, {"can": 0.5, "mug": 0.0}, {"can": 1.0, "mug": 0.0})
-    found = {method: Found(every, ap) for method, every in found.items()}
+    found = {method: Scores(ap, every) for method, every in found.items()}
     run = DetectionGallery(count=2).publish(context, test, found, ["can", "mug"])
     document = json.loads((context.folder / "detection_gallery.json").read_text())
     assert document["methods"]["neural_sim"] == {"right": 2, "wrong": 1, "missed": 3, "ap": 0.25, "ap50": 0.5}

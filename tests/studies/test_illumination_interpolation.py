@@ -62,11 +62,6 @@ def test_the_figure_has_a_row_for_each_object(field, tmp_path):
     assert save(figure, tmp_path / "way.png").stat().st_size > 1000
 
 
-def test_one_step_is_no_way(field):
-    with pytest.raises(ValueError, match="at least 2"):
-        interpolate(field, NerfWRenderer(), CAMERA, POSE, (torch.eye(3)[0], torch.eye(3)[1]), 1)
-
-
 def test_the_report_says_how_much_opacity_and_colour_change(field, context):
     way = interpolate(field, NerfWRenderer(), CAMERA, POSE, (torch.eye(3)[0], torch.eye(3)[1]), 4)
     publish(context, {"drill": way}, "Between two lights")

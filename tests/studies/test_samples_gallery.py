@@ -28,7 +28,9 @@ def test_the_figure_has_a_panel_for_each_method_and_one_of_test_images():
     assert [canvas.shape[:2] for canvas in canvases] == [(65, 9 * 33 - 1)] * 2 + [(32, 9 * 33 - 1)]
     assert float(canvases[2][0, 7 * 33 + 5, 0]) == 1.0  # seven test images
     titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert titles[0] == "neural_sim (total variation to the target: pose 0.25)" and titles[2] == "test images"
+    assert (
+        titles[0] == "neural_sim (total variation from the target: pose 0.25)" and titles[2] == "test images"
+    )
 
 
 def test_distances_are_tabled_where_the_target_is_known(context):
@@ -45,3 +47,16 @@ def test_distances_are_tabled_where_the_target_is_known(context):
     assert MlflowClient(context.uri).get_run(run.run_id).data.metrics == {
         "pitcher/pose/neural_sim": 0.25, "pitcher/pose/auto_sim": 0.5,
     }  # fmt: skip
+
+
+def test_without_a_known_target_there_is_a_sentence_and_no_empty_table():
+    assert "is unknown" in table([samples("mug", {"neural_sim": None, "auto_sim": None})])
+    assert "|" not in table([samples("mug", {"neural_sim": None, "auto_sim": None})])
+
+
+def test_words_of_a_figure_of_few_columns_are_not_cut_off():
+    figure = samples_figure(samples(), 2)
+    figure.draw_without_rendering()
+    words = [figure._suptitle, *(axes._left_title for axes in figure.axes)]
+    assert all(each.get_window_extent().x0 >= 0.0 for each in words)
+    assert all(each.get_window_extent().x1 <= figure.bbox.x1 for each in words)

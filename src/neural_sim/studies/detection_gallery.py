@@ -1,9 +1,9 @@
-"""Detections of several methods on the same photographs, right and wrong (the paper's Sec. C.2)."""
+"""Right and wrong detections of several methods on the same photographs (the paper's Sec. C.2)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,11 +14,11 @@ from torch import Tensor
 from torchvision.ops import box_iou
 from typing_extensions import override
 
-from neural_sim.detector.metrics import AveragePrecision
 from neural_sim.documents import markdown_table
 from neural_sim.ranges import Fraction, PositiveInt, validated
-from neural_sim.report.figures import INK
+from neural_sim.report.figures import INK, titled
 from neural_sim.report.tracking import Run
+from neural_sim.stages.evaluate import Scores
 from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Methods, Task
 from neural_sim.types import LabelledImages
@@ -29,32 +29,15 @@ Detections = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Judged:
-    """The detections in one image, best first.
+    """The detections that count in one image, best first.
 
-    ``kept`` marks the detections that count, ``right`` those of them that match a box of their class, and ``missed``
-    the ground-truth boxes without a match.
+    ``kept`` are their rows among all detections of the image, ``right`` says which of them match a box of their class,
+    and ``missed`` which ground-truth boxes have no match.
     """
 
     kept: Int[Tensor, "d"]
     right: Bool[Tensor, "d"]
     missed: Bool[Tensor, "b"]
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Numbers of correct and wrong detections and of missed boxes of one method, over all test images."""
-
-    right: int
-    wrong: int
-    missed: int
-
-
-@dataclass(frozen=True)
-class Found:
-    """The detections of one method's detector on the test images, and its score there."""
-
-    detections: Sequence[Detections]
-    ap: AveragePrecision
 
 
 @validated
@@ -63,8 +46,8 @@ class DetectionGallery(Task):
     """``+experiment=detection_gallery``: draw and count the detections of several methods on the same photographs.
 
     Args:
-        methods: baselines; the detector of each is trained on the distribution that it learned.
-        count: photographs, evenly spaced over the test images.
+        methods: baselines; each one's detector is trained on the distribution that it learned.
+        count: number of photographs to draw, evenly spaced over the test images.
         draw_above: smallest score of a detection that is drawn and counted.
         overlap: smallest intersection over union of a correct detection with a box of its class.
     """
@@ -85,14 +68,14 @@ class DetectionGallery(Task):
         graphs = context.graphs_of(self.methods, "detection_gallery.methods")
         results = context.results
         test = results(context.graph.targets).test
-        found = {}
-        for method, graph in graphs.items():
-            scores = results(graph.scores(results(graph.learned).last, f"what {method} learned"))
-            found[method] = Found(scores.detections, scores.ap)  # pyright: ignore[reportArgumentType]  (boxes)
+        found = {
+            method: results(graph.scores(results(graph.learned).last, f"what {method} learned"))
+            for method, graph in graphs.items()
+        }
         self.publish(context, test, found, context.graph.names)
 
     def publish(
-        self, context: Context, test: LabelledImages, found: Mapping[str, Found], class_names: Sequence[str]
+        self, context: Context, test: LabelledImages, found: Mapping[str, Scores], class_names: Sequence[str]
     ) -> Run | None:
         """Write detection_gallery.json, detection_gallery.md and the figure, and log counts and AP to MLflow."""
         rows = torch.linspace(0, len(test) - 1, min(self.count, len(test))).round().long()
@@ -100,20 +83,19 @@ class DetectionGallery(Task):
             method: judged(own.detections, test, self.draw_above, self.overlap)
             for method, own in found.items()
         }
-        counts = {method: count(every) for method, every in verdicts.items()}
-        methods = {
-            method: {**asdict(counts[method]), "ap": own.ap.ap, "ap50": own.ap.ap50}
+        methods: dict[str, dict[str, float]] = {
+            method: {**count(verdicts[method]), "ap": own.ap.ap, "ap50": own.ap.ap50}  # pyright: ignore[reportAttributeAccessIssue]  (boxes)
             for method, own in found.items()
         }
         note = (
-            f"{len(test)} test images; detections with a score of {self.draw_above:g} or more, right where they "
-            f"overlap a box of their class by {self.overlap:g} or more."
+            f"Detections with a score of at least {self.draw_above:g} on {len(test)} test images. A detection is right "
+            f"if it is the best one that overlaps a box of its class by at least {self.overlap:g}."
         )
         head = ["method", "right", "wrong", "missed boxes", "AP (0.50 to 0.95)", "AP50"]
         cells = [
-            [method, each.right, each.wrong, each.missed]
-            + [f"{100 * value:.1f}" for value in (found[method].ap.ap, found[method].ap.ap50)]
-            for method, each in counts.items()
+            [method, *(own[key] for key in ("right", "wrong", "missed"))]
+            + [f"{100 * own[key]:.1f}" for key in ("ap", "ap50")]
+            for method, own in methods.items()
         ]
         detections = {method: own.detections for method, own in found.items()}
         return context.publish(
@@ -128,10 +110,10 @@ class DetectionGallery(Task):
 def judge(
     found: Detections, boxes: Float[Tensor, "b 4"], labels: Int[Tensor, "b"], above: float, overlap: float
 ) -> Judged:
-    """Tell correct detections in one image from wrong ones.
+    """Tell right detections in one image from wrong ones.
 
-    Starting with the best, each detection is matched to the free box of its class that it overlaps most, by at least
-    ``overlap``; further detections of the same box are wrong.
+    From the best down, each detection is matched to the free box of its class that it overlaps most, if by at least
+    ``overlap``. A detection of a box that is already matched is wrong.
     """
     order = found["scores"].argsort(descending=True, stable=True)
     kept = order[found["scores"][order] >= above]
@@ -156,11 +138,11 @@ def judged(found: Sequence[Detections], test: LabelledImages, above: float, over
     ]
 
 
-def count(images: Sequence[Judged]) -> Counts:
-    """Count correct and wrong detections, and missed boxes."""
+def count(images: Sequence[Judged]) -> dict[str, int]:
+    """Count right and wrong detections, and missed boxes."""
     right = sum(int(each.right.sum()) for each in images)
     kept, missed = sum(len(each.kept) for each in images), sum(int(each.missed.sum()) for each in images)
-    return Counts(right, kept - right, missed)
+    return {"right": right, "wrong": kept - right, "missed": missed}
 
 
 def detections_figure(
@@ -181,12 +163,10 @@ def detections_figure(
     for line, (method, every) in enumerate(found.items()):
         for column, row in enumerate(rows.tolist()):
             axes = grid[line, column]
-            axes.imshow(
-                test.images[row].clamp(0.0, 1.0).movedim(0, -1).cpu().numpy(), extent=(0, width, height, 0)
-            )
-            _draw(
-                axes, every[row], verdicts[method][row], test.select(slice(row, row + 1)), class_names, width
-            )
+            pixels = test.images[row].clamp(0.0, 1.0).movedim(0, -1).cpu().numpy()
+            axes.imshow(pixels, extent=(0, width, height, 0))
+            missed = test.boxes[row][test.present[row]][verdicts[method][row].missed]
+            _draw(axes, every[row], verdicts[method][row], missed, class_names, width)
             axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
             for spine in axes.spines.values():
                 spine.set_visible(False)
@@ -197,20 +177,14 @@ def detections_figure(
     figure.legend(
         handles, ["right", "wrong", "missed"], loc="outside lower center", ncols=3, frameon=False, fontsize=8
     )
-    figure.suptitle("Detections on the test images", color=INK, fontsize=11)
+    titled(figure, "Detections on the test images")
     return figure
 
 
 def _draw(
-    axes: Any,
-    found: Detections,
-    verdict: Judged,
-    image: LabelledImages,
-    class_names: Sequence[str],
-    width: int,
+    axes: Any, found: Detections, verdict: Judged, missed: Tensor, class_names: Sequence[str], width: int
 ) -> None:
-    there = image.present[0]
-    for box in image.boxes[0][there][verdict.missed].tolist():
+    for box in missed.tolist():
         _box(axes, box, MISSED, dashed=True)
     lowest = list(zip(verdict.kept.tolist(), verdict.right.tolist(), strict=True))[::-1]  # the best on top
     for index, right in lowest:

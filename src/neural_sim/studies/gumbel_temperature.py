@@ -230,8 +230,7 @@ def temperature_figure(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -
         _draw_frequencies(grid[0, column], own, truth)
         _draw_errors(grid[1, column], own, truth)
     grid[1, 0].set_ylabel("relative to the derivative over hard bins", color=INK, fontsize=8)
-    title = f"Gumbel-softmax: relaxed draws, and derivatives from {rows[0].images} of them"
-    figure.suptitle(title, color=INK, fontsize=11)
+    figures.titled(figure, f"Gumbel-softmax: relaxed draws, and derivatives from {rows[0].images} of them")
     handles, labels = grid[1, 0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=8, labelcolor=INK

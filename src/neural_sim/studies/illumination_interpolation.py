@@ -1,4 +1,4 @@
-"""Interpolation between two lights of a field: colour changes, geometry does not (the paper's figure of NeRF-W)."""
+"""Interpolation between two lights of a field, which changes colour but not geometry (the paper's Sec. A.6)."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from neural_sim.documents import markdown_table
 from neural_sim.field.base import RadianceField
 from neural_sim.ranges import Distinct, PositiveInt, validated
 from neural_sim.renderer.nerf_w import NerfWRenderer
-from neural_sim.report.figures import INK, MUTED
+from neural_sim.report.figures import MUTED, titled
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PinholeCamera
 
 UNCHANGED = 1e-6
-"""Differences in opacity between lights up to this one count as none."""
+"""Largest difference in opacity between lights that counts as none."""
 
 
 @dataclass(frozen=True)
 class InterpolatedViews:
     """One object's images between two lights.
 
-    ``opacity_change`` is the largest change from the first image, over all pixels.
+    ``opacity_change`` is the largest change of opacity from the first image, over all pixels.
     """
 
     images: Float[Tensor, "steps height width 3"]
@@ -44,11 +44,11 @@ class InterpolatedViews:
 @validated
 @dataclass(frozen=True)
 class Interpolation(Task):
-    """``+experiment=illumination_interpolation``: every object from one camera, from one anchor light to another.
+    """``+experiment=illumination_interpolation``: render every object under lights from one anchor light to another.
 
     Args:
         ends: numbers of the two anchor lights, from 1.
-        steps: number of images, the ends included.
+        steps: number of images, including both ends.
         image_size: side of the images in pixels.
         phi_deg: first angle of the camera in degrees, see ``neural_sim.cameras.orbit``.
         rho_deg: second angle of the camera in degrees.
@@ -71,7 +71,7 @@ class Interpolation(Task):
         """Return the number of anchor lights."""
         rig = context.experiment.imaging.views.rig
         if rig is None:
-            raise ValueError("interpolation: want renderer=nerf_w, the light is fixed")
+            raise ValueError("interpolation: want renderer=nerf_w; with any other, the light is fixed")
         if max(self.ends) > rig.anchors:
             raise ValueError(
                 f"interpolation.ends: there are {rig.anchors} anchor lights, got {list(self.ends)}"
@@ -100,14 +100,11 @@ def interpolate(
     ends: tuple[Float[Tensor, "k"], Float[Tensor, "k"]],
     steps: int = 7,
 ) -> InterpolatedViews:
-    """Render views over white from one camera under ``steps`` evenly spaced weights, from one end to the other.
+    """Render images over white from one camera, under ``steps`` evenly spaced weights from one end to the other.
 
     Raises:
-        ValueError: there are fewer than two steps.
         RuntimeError: opacity changes by more than ``UNCHANGED``, although the light must not affect the density.
     """
-    if steps < 2:
-        raise ValueError(f"interpolate: want at least 2 steps, got {steps}")
     parts = torch.linspace(0.0, 1.0, steps).to(ends[0])
     images, opacities, pose = [], [], camera_to_world.to(next(field.parameters()).device)
     for part in parts:
@@ -131,19 +128,19 @@ def publish(context: Context, views: Mapping[str, InterpolatedViews], title: str
 
 
 def table(views: Mapping[str, InterpolatedViews], title: str) -> str:
-    """Return a Markdown table of how much colour and opacity change between the lights."""
+    """Return a Markdown table of the changes of opacity and colour between the lights."""
     count = len(next(iter(views.values())).images)
     head = ["object", "largest change of opacity", "mean change of colour from the first light to the last"]
     rows = [
         (name, f"{own.opacity_change:.0e}", f"{float((own.images[-1] - own.images[0]).abs().mean()):.3f}")
         for name, own in views.items()
     ]
-    note = f"{title} in {count} images from one camera. Colours are of 0 to 1."
+    note = f"{title}: {count} images from one camera. Colours and opacities range from 0 to 1."
     return f"{note}\n\n{markdown_table(head, rows)}"
 
 
 def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> Figure:
-    """Draw one row per object, from the first light on the left to the second on the right."""
+    """Draw a row per object, from the first light on the left to the second on the right."""
     count, height, width = next(iter(views.values())).images.shape[:3]
     canvas = np.concatenate(
         [np.concatenate(list(row.images.cpu().numpy()), axis=1) for row in views.values()], axis=0
@@ -162,5 +159,5 @@ def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> 
     for side in axes.spines.values():
         side.set_visible(False)
     change = max(row.opacity_change for row in views.values())
-    figure.suptitle(f"{title} (opacity changes by at most {change:.0e})", color=INK, fontsize=10)
+    titled(figure, f"{title} (opacity changes by at most {change:.0e})", 10)
     return figure

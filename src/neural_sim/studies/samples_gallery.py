@@ -1,4 +1,4 @@
-"""Training images drawn from the distribution that each method learned, next to test images (Sec. C.1)."""
+"""Training images from the distribution that each method learned, next to test images (the paper's Sec. C.1)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing_extensions import override
 from neural_sim.documents import markdown_table
 from neural_sim.parameter.distributions import total_variation
 from neural_sim.ranges import PositiveInt, validated
-from neural_sim.report.figures import INK
+from neural_sim.report.figures import INK, titled
 from neural_sim.report.tracking import Run
 from neural_sim.stages.graph import Graph, Psi
 from neural_sim.stages.stage import Results, Stage
@@ -24,10 +24,9 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class Samples:
-    """Images of one object by method, and test images.
+    """Training images of one object by method, and test images that show it.
 
-    ``distances`` are, by method, the total variation between learned and target distribution of each factor, None if
-    the target's is unknown.
+    ``distances`` are, by method, the total variation of each factor from the target's, None if that is unknown.
     """
 
     object: str
@@ -56,13 +55,17 @@ class SamplesGallery(Task):
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
         names, known = self._names(context), context.graph.names
-        if not names or set(names) - set(known):
+        if not names:
+            raise ValueError(
+                f"samples_gallery.objects: no object has a biased start, want some of {list(known)}"
+            )
+        if set(names) - set(known):
             raise ValueError(f"samples_gallery.objects: want some of {list(known)}, got {list(names)}")
         graphs = context.graphs_of(self.methods, "samples_gallery.methods")
         return [context.graph.targets, *(graph.learned for graph in graphs.values())]
 
     def _names(self, context: Context) -> tuple[str, ...]:
-        return tuple(self.objects or context.experiment.imaging.distribution.biased)
+        return tuple(dict.fromkeys(self.objects or context.experiment.imaging.distribution.biased))
 
     @override
     def run(self, context: Context) -> None:
@@ -85,7 +88,7 @@ class SamplesGallery(Task):
         generator = torch.Generator().manual_seed(graph.experiment.run.seed)
         rendered = results(graph.scene).training_set(psi, self.count, generator)
         images = rendered.images.to("cpu")
-        # If images show several objects, these are the ones drawn for this object.
+        # An image may show other objects, too; the rows are sorted by the object that each was drawn for.
         return [
             images.select(torch.arange(label * self.count, (label + 1) * self.count))
             for label in range(len(graph.names))
@@ -108,7 +111,7 @@ def _distance(graph: Graph, psi: Psi, label: int) -> dict[str, float] | None:
 
 
 def publish(context: Context, samples: Sequence[Samples], columns: int) -> Run | None:
-    """Write samples_gallery.json, samples_gallery.md and a figure for each object, and log the distances to MLflow."""
+    """Write samples_gallery.json, samples_gallery.md and a figure per object, and log the distances to MLflow."""
     document = {
         each.object: {
             "images": {method: len(images) for method, images in each.images.items()},
@@ -128,26 +131,28 @@ def publish(context: Context, samples: Sequence[Samples], columns: int) -> Run |
 
 
 def table(samples: Sequence[Samples]) -> str:
-    """Return a Markdown table of distances by object and factor."""
+    """Return a Markdown table of distances by object and factor, if any target is known."""
+    if all(known is None for each in samples for known in each.distances.values()):
+        return "The target's distribution is unknown, and so are distances to it; figures/ has images of each object."
     methods = list(samples[0].images)
     rows = [
         [f"{each.object}, {factor}", *(f"{(each.distances[method] or {})[factor]:.2f}" for method in methods)]
         for each in samples
         for factor in dict.fromkeys(factor for known in each.distances.values() for factor in known or {})
     ]
-    note = "Total variation of the learned distribution to the target's; figures/ has images of each."
+    note = "Total variation of learned distributions from the target's; figures/ has images of each object."
     return f"{note}\n\n{markdown_table(['object, factor', *methods], rows)}"
 
 
 def samples_figure(samples: Samples, columns: int) -> Figure:
-    """Draw one panel per method and one with test images, with ``columns`` images per row."""
+    """Draw a panel per method and one of test images, each with ``columns`` images per row."""
     panels = {
         method: (images, _caption(samples.distances[method])) for method, images in samples.images.items()
     }
     panels["test images"] = (samples.test, "")
     heights = [0.4 + 1.05 * -(-len(images) // columns) for images, _ in panels.values()]
     total = sum(heights) + 0.35
-    figure = Figure(figsize=(1.05 * columns + 0.2, total))
+    figure = Figure(figsize=(max(1.05 * columns + 0.2, 4.5), total))  # at least as wide as its captions
     top = total - 0.35
     for (name, (images, caption)), height in zip(panels.items(), heights, strict=True):
         axes = figure.add_axes((0.01, (top - height) / total, 0.98, (height - 0.4) / total))
@@ -155,17 +160,17 @@ def samples_figure(samples: Samples, columns: int) -> Figure:
         axes.set_axis_off()
         axes.set_title(name + caption, loc="left", color=INK, fontsize=9)
         top -= height
-    figure.suptitle(f"{samples.object}: images drawn from what was learned", color=INK, fontsize=11)
+    titled(figure, f"{samples.object}: images of what each method learned")
     return figure
 
 
 def _caption(distances: Mapping[str, float] | None) -> str:
     parts = [f"{factor} {value:.2f}" for factor, value in (distances or {}).items()]
-    return f" (total variation to the target: {', '.join(parts)})" if parts else ""
+    return f" (total variation from the target: {', '.join(parts)})" if parts else ""
 
 
 def _canvas(images: LabelledImages, columns: int) -> np.ndarray:
-    """Lay images out row by row with white gaps."""
+    """Lay out images row by row, with white gaps."""
     height, width = images.images.shape[-2:]
     gap, rows = max(1, width // 32), max(1, -(-len(images) // columns))
     canvas = np.ones((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), dtype=np.float32)
