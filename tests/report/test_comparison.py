@@ -266,3 +266,14 @@ def test_an_object_that_no_test_image_shows_is_in_no_curve():
     point = {"images": 9, "seconds": 2.0, "ap": {"ap": 0.5, "per_class": {"can": 0.5, "mug": None}}}
     run = finished(AP, experiment="gap", method="ours", seed=0, curve=[point])
     assert biased_ap(run, "seconds")[1].tolist() == [0.5]
+
+
+def test_costs_of_unequal_numbers_of_runs_say_so():
+    def spent(method, seed, seconds):
+        made = run(method, seed, 0.5, (seconds,))
+        return dataclasses.replace(made, results={**made.results, "iterations": []})
+
+    runs = [spent("ours", 0, 10.0), spent("ours", 1, 30.0), spent("other", 0, 10.0)]
+    text = costs_table(runs)
+    assert "| ours, mean of 2 |" in text and "| other, mean of 1 |" in text
+    assert "different numbers of runs" in text and "mean of" not in costs_table(runs[1:])

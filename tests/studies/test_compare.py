@@ -244,7 +244,7 @@ def test_the_verdict_names_who_is_ahead_behind_and_not_told_apart(comparison):
         "not told apart from third."
     )
     one = verdict(replace(comparison, seeds=(3,)))
-    assert one.endswith("from third; one seed, so that how much trainings differ is not in this.")
+    assert one.endswith("from third; from one seed, whose intervals leave out how much trainings differ.")
 
 
 def test_leads_of_runs_that_were_scored_once_do_not_stand_out(comparison, tmp_path):

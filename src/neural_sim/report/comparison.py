@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -320,11 +321,17 @@ def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
 
 
 def costs_table(runs: Sequence[FinishedRun]) -> str:
-    """Return a Markdown table with one row per method."""
-    table = markdown_table(["cost", *HEAD], [[method, *cells(cost)] for method, cost in costs(runs).items()])
+    """Return a Markdown table with one row per method, which says how many runs it has if these numbers differ."""
+    number = Counter(run.method for run in runs)
+    unequal = len({*number.values()}) > 1
+    rows = [
+        [f"{method}, mean of {number[method]}" if unequal else method, *cells(cost)]
+        for method, cost in costs(runs).items()
+    ]
     commits = sorted({run.results.get("commit") or UNKNOWN for run in runs})
+    note = " Methods have different numbers of runs, which may be of different settings." if unequal else ""
     made = f"{len(runs)} run{'s' * (len(runs) > 1)}, commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
-    return f"{table}\n\n{made}. {NOTE}"
+    return f"{markdown_table(['cost', *HEAD], rows)}\n\n{made}.{note} {NOTE}"
 
 
 def cells(cost: Costs) -> list[str]:

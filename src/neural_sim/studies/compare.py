@@ -1,4 +1,4 @@
-"""Study ``compare``: compare all methods of an experiment, using finished runs; ``+experiment=compare``."""
+"""``+experiment=compare``: compare the methods of experiments by their finished runs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Compare(Task):
         reference: the method that the others are compared with.
         draws: bootstrap draws over test images.
         clock: ``seconds`` of wall-clock time, or ``cpu_seconds`` of all cores together, for runs that shared a machine.
-        methods: methods to compare; null: all that have runs. Only seeds that all of them have are used.
+        methods: methods to compare; null: all that have runs. Only the seeds that all of them have are used.
     """
 
     experiments: Annotated[tuple[str, ...], MinLen(1)]
@@ -66,7 +66,7 @@ class Compare(Task):
         groups, left_out = self.selected(Runs.read(context.uri, self.experiments))
         tables = [self.table(group, context.config["seed"]) for group in groups]
         page = write_page(tables, left_out, context.folder)
-        labels = ", ".join(table.group.label for table in tables)
+        labels = [table.group.label for table in tables]
         context.publish(
             "compare",
             {
@@ -76,8 +76,8 @@ class Compare(Task):
             compare_markdown(tables, left_out),
             {table.slug: table.figure for table in tables},
             {name: value for table in tables for name, value in table.metrics.items()},
-            tags={"compared": ",".join(table.group.label for table in tables)},
-            title=labels,
+            tags={"compared": ",".join(labels)},
+            title=", ".join(labels),
         )
         shown = [tracking.where_runs(context.uri, name) for name in dict.fromkeys(self.experiments)]
         lines = dict.fromkeys(line for where in shown for line in where.splitlines())  # one command for all
@@ -87,7 +87,7 @@ class Compare(Task):
         """Return the groups of runs to compare, and the runs that are left out.
 
         Raises:
-            ValueError: a named method has no run, or no run can be compared; the message has the reasons.
+            ValueError: a method in ``methods`` has no run, or no run can be compared; the message has the reasons.
         """
         known = {run.results.get("method") for run in runs.rows}
         missing = sorted(set(self.methods or ()) - known)
@@ -113,7 +113,7 @@ class Compare(Task):
 
 @dataclass(frozen=True)
 class Table:
-    """The comparison of one group of runs, a part of compare.md, compare.json and the page."""
+    """The comparison of one group of runs: a section of compare.md and of the page, and an entry of compare.json."""
 
     group: Group
     comparison: Comparison
@@ -124,7 +124,7 @@ class Table:
 
     @property
     def slug(self) -> str:
-        """The setting in a form to use in names of files and metrics."""
+        """The group's label as a part of names of files and metrics."""
         return self.group.label.replace(", ", "_").replace(" ", "_")
 
     @property
@@ -175,12 +175,12 @@ class Table:
 
     @property
     def warning(self) -> str:
-        """Warning about what scores at smaller budgets cannot tell; empty if there is nothing to warn of."""
+        """A warning that scores at smaller budgets do not show which method leads; empty if they do."""
         return ONLY_AT_END if self.comparison.only_at_end else ""
 
     @property
     def cautions(self) -> list[str]:
-        """What a reader must know before reading the scores."""
+        """Warnings to put before the scores."""
         return cautions(self.group.runs)
 
     @property
@@ -201,7 +201,7 @@ def compare_markdown(tables: Sequence[Table], left_out: Sequence[LeftOut]) -> st
 
 
 def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
-    """Return the section of compare.md on left-out runs; nothing if every run was compared."""
+    """Return the section on runs that were left out, in a list; empty if there are none."""
     if not left_out:
         return []
     rows = [(", ".join(runs), reason.replace("\n", " ")) for reason, runs in by_reason(left_out).items()]
@@ -209,7 +209,7 @@ def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
 
 
 def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str = "") -> str:
-    """Return the table of one setting, its differences, the distances of the learned distributions, and costs.
+    """Return the scores and leads of one group, the distances of the learned distributions, and the costs.
 
     Args:
         comparison: comparison of the runs.
@@ -230,9 +230,9 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         _scores_table(c),
         f"{bold}Images, steps and seconds include the warm start, whose backbone every loop trains on; fields, which "
         "all methods share, and the labelled validation images are not counted. "
-        "The fraction closed has no interval where the gap's own includes 0. "
-        f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
-        "iterations linear in log seconds.",
+        "The fraction of the gap that is closed has no interval if the gap's own interval includes 0. "
+        f"The {c.score} after {c.equal_cost:.0f} {_unit(c)}, the time of the cheapest method, is interpolated between "
+        "scored iterations, linearly in log seconds.",
         *[ONLY_AT_END] * c.only_at_end,
         *_leads(c),
         *_distances(c, runs),
@@ -274,18 +274,18 @@ def _leads(c: Comparison) -> list[str]:
         return []
     head = [f"{c.reference} ahead after ({_unit(c)}), of", *(f"{budget:.0f}" for budget in c.budgets)]
     rows = [[method, *(points(lead, sure=c.timed) for lead in leads)] for method, leads in c.ahead_at.items()]
-    note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."
+    note = f"A method that has ended keeps its last {c.score}; until its first scored iteration, it has its start's."
     return [markdown_table(head, rows), note]
 
 
 def cautions(runs: Sequence[FinishedRun]) -> list[str]:
-    """Return warnings to put before the scores: runs at a scale at which scores mean nothing."""
+    """Return warnings to put before the scores, for runs at a scale at which scores mean nothing."""
     scales = dict.fromkeys(run.results.get("scale", "") for run in runs)
     return [said for scale in scales if (said := caution(scale))]
 
 
 def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
-    """Return a warning if the seconds in a table come from different kinds of devices."""
+    """Return a warning, in a list, if the runs were made on different kinds of devices."""
     kinds: dict[str, list[str]] = {}
     for run in runs:
         kind = run.results["config"]["trainer"]["accelerator"]
@@ -293,11 +293,13 @@ def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
     if len(kinds) == 1:
         return []
     named = "; ".join(f"{kind}: {', '.join(which)}" for kind, which in kinds.items())
-    return [f"Seconds are not comparable, the runs were made on devices of several kinds ({named})."]
+    return [
+        f"Seconds are not comparable, because the runs were made on different kinds of devices ({named})."
+    ]
 
 
 def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]:
-    """Return mean distances of every biased object and factor; nothing if the target is unknown."""
+    """Return a table of mean distances by biased object and factor; no table if the target is unknown."""
     rows = []
     table = {(run.method, run.seed): run.results["total_variation"] for run in runs}
     for name in runs[0].results["biased"]:
@@ -315,15 +317,15 @@ def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]
 def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
     """Draw the score of the biased objects against images and against seconds, one line per seed."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    figure.suptitle(comparison.setting, color=figures.INK, fontsize=11)
+    figures.titled(figure, comparison.setting)
     for place, key in enumerate(("images", comparison.clock), 1):
         axes = figure.add_subplot(1, 2, place)
         for number, method in enumerate(comparison.methods):
             colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
             for line, run in enumerate(run for run in runs if run.method == method):
                 spent = [point[key] for point in run.results["curve"]]
-                # A step function: at any time a method has the score it has reached so far. (Areas interpolate
-                # the score linearly in log seconds instead.)
+                # Steps show the score that a method has reached so far; areas, in contrast, interpolate it linearly
+                # in log seconds.
                 axes.plot(
                     spent, 100 * biased_ap(run, comparison.clock)[1], ".-", drawstyle="steps-post", color=colour,
                     alpha=0.7, linewidth=1, label=method if line == 0 else None,
@@ -345,9 +347,9 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
 
 
 def verdict(comparison: Comparison) -> str:
-    """Say which methods the reference is ahead of in final score, and which it cannot be told apart from.
+    """Say which methods the reference is ahead of or behind in final score, and which it cannot be told apart from.
 
-    For a single seed it adds that the intervals do not include the scatter between trainings.
+    For a single seed, it adds that the intervals do not include the scatter between trainings.
     """
     c = comparison
     reached = c.ap[c.reference]
@@ -359,7 +361,7 @@ def verdict(comparison: Comparison) -> str:
     untold = [method for method, lead in c.ahead.items() if not lead.certain]
     if untold:
         parts.append(f"not told apart from {listed(untold)}")
-    one = "; one seed, so that how much trainings differ is not in this" if len(c.seeds) == 1 else ""
+    one = "; from one seed, whose intervals leave out how much trainings differ" if not c.several else ""
     return ", ".join(parts) + one + "."
 
 
