@@ -11,7 +11,7 @@ from neural_sim.studies.experiments.charts import (
     levels_entries,
     levels_figure,
 )
-from neural_sim.studies.experiments.results import table
+from neural_sim.studies.experiments.results import Setting, table
 
 METHODS = (("neural_sim", 0.75), ("lts", 0.5))
 
@@ -71,6 +71,37 @@ def test_table_and_summary_have_the_scores_of_every_object():
     lines = [entry.line for entry in entries if entry.line]
     assert [line.split(":")[0] for line in lines] == ["gap, can", "gap, mug"]
     assert all("NSO 75." in line and "LTS by 2" in line and "matched" not in line for line in lines)
+
+
+def test_settings_of_two_targets_do_not_stand_for_each_other():
+    """One experiment, whose command line moved the target: both are shown, and named by their targets."""
+    made = [setting(target=target, commit=f"of{target}") for target in (3, 1)]
+    entries = levels_entries(made, "gap")
+    assert [(e.cells["object"], e.cells["target"], *e.commits) for e in entries] == [
+        (name, target, f"of{target}") for name in ("can", "mug") for target in ("1", "3")
+    ]
+    assert entries[0].line.startswith("gap, can, target 1: NSO 75.")
+    titles = [axes.get_title() for axes in levels_figure(made, "gap").axes]
+    assert titles == [f"gap: {name}, target {target}" for name in ("can", "mug") for target in (1, 3)]
+
+
+def test_of_two_settings_at_one_place_the_newest_is_shown_and_the_other_named(caplog):
+    made = [setting(commit="newest"), setting(commit="older", initial=6)]
+    entries = levels_entries(made, "gap")
+    assert [entry.commits for entry in entries] == [["newest"]] * 2
+    assert "gap: can has older settings at disjoint, which are left out" in caplog.text
+
+
+def test_methods_without_a_colour_of_their_own_can_be_told_apart():
+    methods = (("neural_sim", 0.75), ("response", 0.5), ("label_shift", 0.6))
+    lines = levels_figure([setting(methods=methods)], "gap").axes[0].containers
+    assert len({line.lines[0].get_color() for line in lines}) == len(lines) == 5
+
+
+def test_lines_name_the_reference_that_was_asked_for():
+    runs = setting(methods=METHODS).group
+    verdict = Setting.of(runs, "lts", draws=5).verdict("can")
+    assert verdict.startswith("LTS 5") and "NSO by -2" in verdict
 
 
 HALF = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]

@@ -184,7 +184,7 @@ def test_a_page_keeps_settings_without_runs_here_beside_those_with(page, tmp_pat
 
 def test_our_scores_stand_beside_those_of_the_papers_table():
     shown = LAYOUTS["objects"](MEASURED["gap"][1:], Paper(**TABLE))
-    assert shown.lines[0].startswith("gap, disjoint: mAP of NSO 75.2")
+    assert shown.lines[0].startswith("gap, disjoint, mAP: NSO 75.2")
     head, _, mean, can, mug = shown.text.splitlines()[2:]
     assert head == "|  | NS, ours | LTS, ours | NSO, ours | matched, ours | NS, the paper | NSO, the paper |"
     assert mean.startswith("| mAP | 38.1") and mean.endswith("| 10 | 20 |")

@@ -1,15 +1,16 @@
 """Charts of scores and distributions, and table rows with the same numbers.
 
-Scores of biased objects over starts (the paper's Fig. 5) or targets (Fig. 6); learned and target distributions (Fig. 7)
-and their total variation over seeds. Bins that look alike are merged.
+Scores of biased objects are drawn over starts (the paper's Fig. 5) or targets (Fig. 6), and learned distributions next
+to the target's (Fig. 7), with their total variation over seeds. Bins that look alike are merged.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -21,14 +22,43 @@ from neural_sim.report.figures import Figure
 from neural_sim.report.intervals import Estimate, over_seeds, points
 from neural_sim.studies.experiments.results import Entry, Setting, called, modes
 
+_log = logging.getLogger(__name__)
 Axis = Literal["gap", "target"]
 STARTS = {"same": "the target's", "uniform": "uniform", "disjoint": "disjoint"}
 """The starts in the paper's Fig. 5."""
-COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
-"""Line colours of the methods."""
+COLOURS = {
+    "ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5", "matched": figures.MUTED,
+}  # fmt: skip
+"""Line colours of the methods; others take those of ``OTHERS``, in order."""
+OTHERS = ("#7b5cc4", "#d98a1f", "#1f9fb5", "#b5407f", "#8c6d1f")
 APART = 0.03
 """Horizontal offset between methods, as a fraction of the distance between ticks."""
 LABELS = {"gap": "initial distribution", "target": "bins of the target"}
+
+
+class Panel(NamedTuple):
+    """What one panel of a figure shows.
+
+    ``start`` is the initial distribution, empty if that is the axis. ``aim`` is the target, empty if that is the axis
+    or the experiment has only one target for the object.
+    """
+
+    experiment: str
+    start: str
+    name: str
+    aim: str
+
+    @property
+    def title(self) -> str:
+        """The title of the panel."""
+        start = f", from the {self.start} start" if self.start else ""
+        return f"{self.experiment}: {short(self.name)}{f', target {self.aim}' if self.aim else ''}{start}"
+
+    @property
+    def place(self) -> tuple[str | int, ...]:
+        """The place of its rows in a table."""
+        named = f"{self.name}, {self.aim}" if self.aim else self.name
+        return self.experiment, ["", *STARTS.values()].index(self.start), named
 
 
 def short(name: str) -> str:
@@ -37,10 +67,17 @@ def short(name: str) -> str:
 
 
 def place(setting: Setting, name: str, axis: Axis) -> str:
-    """Return the label of a setting of an object on the axis."""
+    """Return the label on the axis of an object's start or target."""
     if axis == "gap":
         return STARTS[setting.gap]
     return "; ".join(modes(setting.distribution("target", name, f)) for f in setting.factors(name))
+
+
+def colours(settings: Sequence[Setting]) -> dict[str, str]:
+    """Return a colour for every method."""
+    methods = list(dict.fromkeys(method for setting in settings for method in setting.methods))
+    others = [method for method in methods if method not in COLOURS]
+    return COLOURS | {method: OTHERS[i % len(OTHERS)] for i, method in enumerate(others)}
 
 
 def _order(label: str, axis: Axis) -> tuple[Any, ...]:
@@ -49,41 +86,49 @@ def _order(label: str, axis: Axis) -> tuple[Any, ...]:
     return (label.count(","), label)
 
 
-def _panels(settings: Sequence[Setting], axis: Axis) -> dict[tuple[str, str, str], dict[str, Setting]]:
-    """Group settings by experiment, start (unless that is the axis) and object, then by place on the axis."""
-    panels: dict[tuple[str, str, str], dict[str, Setting]] = {}
+def _panels(settings: Sequence[Setting], axis: Axis) -> dict[Panel, dict[str, Setting]]:
+    """Group settings by panel, then by place on the axis; of several at one place, the newest is kept.
+
+    ``settings`` are sorted by experiment, the newest of each first.
+    """
+    aims: dict[tuple[str, str], set[str]] = {}
     for setting in settings:
         for name in setting.objects:
-            start = "" if axis == "gap" else STARTS[setting.gap]
-            panel = panels.setdefault((setting.experiment, start, name), {})
-            panel[place(setting, name, axis)] = setting
+            aims.setdefault((setting.experiment, name), set()).add(place(setting, name, "target"))
+    panels: dict[Panel, dict[str, Setting]] = {}
+    for setting in settings:
+        for name in setting.objects:
+            several = axis == "gap" and len(aims[setting.experiment, name]) > 1
+            aim = place(setting, name, "target") if several else ""
+            key = Panel(setting.experiment, "" if axis == "gap" else STARTS[setting.gap], name, aim)
+            label, panel = place(setting, name, axis), panels.setdefault(key, {})
+            if label in panel:
+                _log.warning("experiments: %s has older settings at %s, which are left out", key.title, label)
+            panel.setdefault(label, setting)
+    experiments = [setting.experiment for setting in settings]
     return {
         key: dict(sorted(panel.items(), key=lambda item: _order(item[0], axis)))
-        for key, panel in sorted(panels.items(), key=lambda item: _rank(item[0], settings))
+        for key, panel in sorted(
+            panels.items(), key=lambda item: (experiments.index(item[0].experiment), *item[0].place[1:])
+        )
     }
 
 
-def _rank(key: tuple[str, str, str], settings: Sequence[Setting]) -> tuple[int, int, str]:
-    experiments = [setting.experiment for setting in settings]
-    starts = ["", *STARTS.values()]
-    return experiments.index(key[0]), starts.index(key[1]), key[2]
-
-
 def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
-    """Draw one panel per object and one line per method, with 95 % intervals; matched, the upper bound, is dashed."""
-    panels = _panels(settings, axis)
+    """Draw a panel per object and a line per method, with 95 % intervals; matched, the upper bound, is dashed."""
+    panels, colour = _panels(settings, axis), colours(settings)
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.6 * columns + 0.8, 2.6 * rows + 0.5), layout="constrained")
     handles: dict[str, Any] = {}
-    for number, ((experiment, start, name), panel) in enumerate(panels.items(), 1):
+    for number, (key, panel) in enumerate(panels.items(), 1):
         axes = figure.add_subplot(rows, columns, number)
         methods = list(dict.fromkeys(m for setting in panel.values() for m in setting.methods))
         for i, method in enumerate(methods):
             aside = APART * (i - (len(methods) - 1) / 2)
-            handles.setdefault(called(method), _line(axes, list(panel.values()), name, method, aside))
-        title = short(name) + (f", from the {start} start" if start else "")
-        axes.set_title(f"{experiment}: {title}", fontsize=9, color=figures.INK)
+            line = _line(axes, list(panel.values()), key.name, method, aside, colour[method])
+            handles.setdefault(called(method), line)
+        axes.set_title(key.title, fontsize=9, color=figures.INK)
         axes.set_xticks(range(len(panel)), list(panel))
         axes.set(ylim=(0, 100), xlim=(-0.3, len(panel) - 0.7))
         axes.set_xlabel(LABELS[axis], fontsize=8, color=figures.MUTED)
@@ -96,10 +141,11 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
     return figure
 
 
-def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: float) -> Any:
+def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: float, colour: str) -> Any:
     """Draw the line of one method, shifted from the ticks by ``aside`` so that intervals do not hide each other.
 
-    Settings without a run of the method are gaps. Matched has a dash at every setting, so that a single one is visible.
+    The line has gaps at settings without a run of the method. That of matched has a dash at every setting, so that a
+    single one is visible.
     """
     found = [setting.score(method, name) if method in setting.table.detectors else None for setting in panel]
     values = 100 * np.asarray([np.nan if each is None else each.value for each in found])
@@ -112,26 +158,27 @@ def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: fl
     return axes.errorbar(
         np.arange(len(panel)) + (0.0 if bound else aside), values, None if bound else spread,
         fmt="_--" if bound else "o-", markersize=24.0 if bound else 3.5,
-        color=COLOURS.get(method, figures.MUTED if bound else "#7b5cc4"), linewidth=1.2, capsize=2,
+        color=colour, linewidth=1.2, capsize=2,
     )  # fmt: skip
 
 
 def levels_entries(settings: Sequence[Setting], axis: Axis) -> list[Entry]:
-    """Return the score of every object at every setting, one column per method, in points with 95 % intervals.
+    """Return a row for every object at every setting, with a score per method in points and 95 % intervals.
 
-    Lines give the score of NSO and its lead; over ``gap``, only for the disjoint start.
+    The rows' lines give the reference's score and its leads; over ``gap``, only rows of the disjoint start have one.
     """
     made = []
-    for (experiment, start, name), panel in _panels(settings, axis).items():
+    for key, panel in _panels(settings, axis).items():
         for label, setting in panel.items():
-            cells = {"experiment": experiment, "object": short(name)}
-            cells |= {"start": start} if axis == "target" else {}
+            cells = {"experiment": key.experiment, "object": short(key.name)}
+            cells |= {"start": key.start} if axis == "target" else {"target": key.aim} if key.aim else {}
             cells |= {LABELS[axis]: label, "seeds": setting.seeds}
-            cells |= {called(method): points(setting.score(method, name)) for method in setting.columns}
-            place = (experiment, *_rank((experiment, start, name), settings)[1:], *_order(label, axis))
-            where = f", {start} start, target {label}" if start else ""
-            line = f"{experiment}, {short(name)}{where}: {setting.verdict(name)}"
+            cells |= {called(method): points(setting.score(method, key.name)) for method in setting.columns}
+            where = f", {key.start} start, target {label}" if key.start else ""
+            where += f", target {key.aim}" if key.aim else ""
+            line = f"{key.experiment}, {short(key.name)}{where}: {setting.verdict(key.name)}"
             shown = axis == "target" or setting.gap == "disjoint"
+            place = (*key.place, *_order(label, axis))
             made.append(Entry(place, cells, line if shown else "", setting.commits))
     return made
 
@@ -149,7 +196,7 @@ class Histogram:
         seeds: seeds of the runs.
         groups: groups of bins, numbered from 1, that look the same.
         p: initial, target and learned probabilities.
-        distance: mean total variation from the target, of the initial and of the learned distribution.
+        distance: mean total variation of the initial and of the learned distribution from the target's.
         commits: code commits of the runs.
     """
 
@@ -195,21 +242,23 @@ def _histogram(setting: Setting, name: str, factor: str) -> Histogram:
 
 
 def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
-    """Draw one panel per start: initial, learned (mean, smallest and largest over seeds) and target probabilities."""
+    """Draw a panel per histogram: initial, learned (mean, smallest and largest over seeds) and target probabilities."""
     columns = min(3, len(all_of))
     rows = -(-len(all_of) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.4 * rows + 0.6), layout="constrained")
-    colours = {"initial": figures.METHOD_COLOURS["ns"], "learned": figures.METHOD_COLOURS["learned"],
+    shown = {"initial": figures.METHOD_COLOURS["ns"], "learned": figures.METHOD_COLOURS["learned"],
                "target": figures.METHOD_COLOURS["matched"]}  # fmt: skip
     handles = []
     for number, each in enumerate(all_of, 1):
         axes, x = figure.add_subplot(rows, columns, number), np.arange(len(each.groups))
         handles = []
-        for i, (which, colour) in enumerate(colours.items()):
+        for i, (which, colour) in enumerate(shown.items()):
             p = each.p[which]
             mean = p.mean(0)
             spread = None
-            if which == "learned" and len(p) > 1:  # the mean of equal numbers may round past them
+            if (
+                which == "learned" and len(p) > 1
+            ):  # clipped, because the mean of equal numbers may round past them
                 spread = np.stack([mean - p.min(0), p.max(0) - mean]).clip(min=0.0)
             bars = axes.bar(x + 0.28 * (i - 1), mean, 0.26, yerr=spread, color=colour, capsize=2,
                             error_kw={"linewidth": 0.8, "ecolor": figures.INK})  # fmt: skip
@@ -222,7 +271,7 @@ def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
         axes.yaxis.grid(color=figures.GRID)
         axes.set_axisbelow(True)
         figures.style(axes)
-    figure.legend(handles, list(colours), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(handles, list(shown), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return figure
 
 
@@ -234,7 +283,7 @@ def distance(estimate: Estimate) -> str:
 
 
 def histogram_entries(all_of: Sequence[Histogram]) -> list[Entry]:
-    """Return total variation to the target, with 95 % intervals over seeds."""
+    """Return a row per histogram with its total variation from the target, with 95 % intervals over seeds."""
     made = []
     for h in all_of:
         initial, learned = (distance(h.distance[which]) for which in ("initial", "learned"))

@@ -1,4 +1,4 @@
-"""Layouts of the results of finished runs: lines for the table of experiments, separate tables, and figures."""
+"""Layouts of the results of finished runs: lines for the table of experiments, tables below it, and figures."""
 
 from __future__ import annotations
 
@@ -48,10 +48,11 @@ class Shown:
 class Paper:
     """A table of the paper, from conf/paper/numbers.yaml.
 
-    title: title of the table in the paper.
-    lines: first and last line in the LaTeX source of the paper.
-    columns: titles of the columns.
-    rows: numbers in each named row, one per column, None where the paper prints none.
+    Args:
+        title: title of the table in the paper.
+        lines: first and last line in the LaTeX source of the paper.
+        columns: titles of the columns.
+        rows: one number per column by name of the row, None where the paper prints none.
 
     Raises:
         ValueError: a row does not have one number per column.
@@ -91,12 +92,12 @@ def _histograms(settings: Sequence[Setting], paper: Paper | None) -> Shown:
 
 
 def _objects(settings: Sequence[Setting], paper: Paper | None) -> Shown:
-    """Show our scores next to the paper's Table 1: rows are objects, columns are methods, ours and the paper's."""
+    """Show our scores next to those of the paper's Table 1: rows are objects, columns are methods."""
     lines, parts = [], []
     means = {"AP": MEAN, "accuracy": "mean accuracy"}
     for setting in settings:
         label, mean = setting.group.label, means[setting.first.score]
-        lines.append(f"{label}: {mean} of {setting.verdict()}")
+        lines.append(f"{label}, {mean}: {setting.verdict()}")
         parts.append(f"{label}, seeds {setting.seeds}:\n\n{objects_table(setting, paper, mean)}")
     return Shown(lines, "\n\n".join(parts))
 
@@ -123,8 +124,7 @@ def _photographs(settings: Sequence[Setting], paper: Paper | None) -> Shown:
 def asked(setting: Setting) -> tuple[float, str]:
     """Return how many photographs a setting asks for, as a number to sort by and in words.
 
-    Numbers and fractions are those in the configuration; if there were fewer photographs, their number follows in
-    brackets.
+    The words have the configured number or fraction. The number that was used follows in brackets if it differs.
     """
     real = setting.first.results["config"]["training"]["real"]
     trained = [run.results["real"].get("photographs", 0) for run in setting.group.runs]
@@ -154,17 +154,17 @@ def photographs_table(settings: Sequence[Setting]) -> str:
 
 
 def _rank(setting: Setting) -> tuple[int, int]:
-    """Return a sort key that puts settings with all methods first, so that methods keep one order."""
+    """Return a sort key: by mode, and by number of methods, so that the first setting fixes the order of the rows."""
     return list(WAYS).index(_mode(setting)), -len(setting.methods)
 
 
 def _mode(setting: Setting) -> str:
-    """Return the mode of training on photographs, ``none`` also if there were no photographs."""
+    """Return the mode of training on photographs; ``none`` also if there were none."""
     return setting.first.results["real"].get("mode", NONE)
 
 
 def photographs_summary(settings: Sequence[Setting]) -> list[str]:
-    """Return the lead of NSO over NS and the score of photographs alone, for each setting."""
+    """Return the reference's score and leads, and the score of photographs alone, for each setting."""
     lines = []
     for setting in sorted(settings, key=asked):
         known = "real_only" in setting.columns
@@ -187,18 +187,18 @@ def _seconds(settings: Sequence[Setting], paper: Paper | None) -> Shown:
 
 
 def _iteration(record: Mapping[str, Any]) -> float:
-    """Return the seconds of an iteration; phases ``hypergradient_*`` are excluded as parts of ``hypergradient``."""
+    """Return the seconds of an iteration; phases ``hypergradient_*`` are parts of ``hypergradient``, counted once."""
     return sum(s for phase, s in record["seconds"].items() if not phase.startswith("hypergradient_"))
 
 
 def _field(run: Mapping[str, Any]) -> float:
-    """Return the mean seconds per field; a field found in the store counts with the time that its fit took."""
+    """Return the mean seconds per field; one that was read from the store counts with the time that its fit took."""
     stored = [o["seconds"] for o in run["left_out"] if o["stage"] == "field" and o["seconds"] is not None]
     return (run["seconds"]["field"] + sum(stored)) / len(run["psi"])
 
 
 def _range(values: Sequence[float]) -> str:
-    """Write the median, and the range if values differ: first iterations run two more trainings than the last."""
+    """Write the median, and the range if values differ, as those of iterations with different trainings do."""
     low, middle, high = (f"{value:.1f}" for value in (min(values), median(values), max(values)))
     return low if low == high else f"{middle} ({low} to {high})"
 
@@ -211,4 +211,4 @@ LAYOUTS: Mapping[str, Callable[[Sequence[Setting], Paper | None], Shown]] = {
     "photographs": _photographs,
     "seconds": _seconds,
 }
-"""Layouts by the name that a row of ``experiments.rows`` gives."""
+"""Layouts by name, as in ``experiments.rows``."""

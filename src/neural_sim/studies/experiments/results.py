@@ -1,7 +1,7 @@
-"""Results of an experiment: the settings that were run, each with its runs and their scores, and the rows of a page.
+"""Results of an experiment: its settings, each with its runs and their scores, and the rows of a page.
 
-Settings are scored in the newest way. Rows are kept in a file next to the page, so that runs from several machines can
-fill one page.
+If runs were scored in several ways, those scored like the newest count. Rows are kept in a file next to the page, so
+that runs from several machines can fill one page.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from neural_sim.report.score_table import ScoreTable
 from neural_sim.report.tracking import UNKNOWN, flatten
 
 AXES = re.compile(r"parameter\.\w+\.(gap|biased)\b|training\.real\.(mode|count|fraction)$")
-"""Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects, and how
-many photographs are trained on, and how."""
+"""Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects, and the
+number and use of photographs in training."""
 MEAN = "mAP"
 """Name under which the mean over biased objects is listed with the objects."""
 CALLED = {"ns": "NS", "matched": "matched", "neural_sim": "NSO", "auto_sim": "Auto-Sim", "lts": "LTS"}
@@ -83,14 +83,14 @@ class Setting:
 
     @cached_property
     def methods(self) -> list[str]:
-        """The detectors in order, from ns to matched, the upper bound; the reference is the last that learns."""
+        """The detectors in the order of columns: ns, the methods, of which the reference is the last, and matched."""
         learned = [name for name in self.table.detectors if name not in (*BOUNDS, *WITHOUT, self.reference)]
         order = ["ns", *sorted(learned, reverse=True), self.reference, "matched"]
         return [name for name in order if name in self.table.detectors]
 
     @property
     def columns(self) -> list[str]:
-        """The detectors, including, if photographs train, those without synthetic images or without photographs."""
+        """``methods`` and, if training used photographs, detectors trained without them or without synthetic images."""
         return [*self.methods, *(name for name in WITHOUT if name in self.table.detectors)]
 
     @property
@@ -100,7 +100,7 @@ class Setting:
 
     @property
     def of_reference(self) -> list[Mapping[str, Any]]:
-        """results.json of each run of the reference method, one per seed."""
+        """The results.json of the reference's runs, one per seed."""
         return [run.results for run in self.group.runs if run.method == self.reference]
 
     def score(self, method: str, name: str = MEAN) -> Estimate:
@@ -119,7 +119,7 @@ class Setting:
         ours = points(self.score(self.reference, name))
         others = [method for method in self.methods if method not in (self.reference, "matched")]
         ahead = [f"{called(method)} by {points(self.ahead(method, name))}" for method in others]
-        return f"NSO {ours}; ahead of {', '.join(ahead)}"
+        return f"{called(self.reference)} {ours}" + (f"; ahead of {', '.join(ahead)}" if ahead else "")
 
     def distribution(self, which: str, name: str, factor: str) -> list[float]:
         """Return the ``initial`` or ``target`` distribution of an object."""
@@ -136,7 +136,7 @@ class Settings:
 
     Args:
         uri: address of the MLflow store.
-        budget: ``budget`` (scale) that runs must have in their configuration.
+        budget: the ``budget`` (scale) that runs must have in their configuration; others are left out.
         reference: the method that the others are compared with.
         draws: number of bootstrap draws.
         seed: seed of the bootstrap.
@@ -151,7 +151,7 @@ class Settings:
     def read(self, experiments: Sequence[str]) -> tuple[list[Setting], list[LeftOut]]:
         """Return the settings of experiments, and the runs that are left out.
 
-        Settings are ordered by experiment, then by first run. An experiment without runs has none.
+        Settings are ordered by experiment, and those of one experiment from the newest to the oldest.
         """
         known = tracking.experiments(self.uri)
         groups, left_out = self.groups(Runs.read(self.uri, [name for name in experiments if name in known]))
@@ -159,7 +159,7 @@ class Settings:
         return [Setting.of(group, self.reference, self.draws, self.seed) for group in groups], left_out
 
     def groups(self, runs: Runs) -> tuple[list[Group], list[LeftOut]]:
-        """Return groups of runs to compare; if an experiment was scored in several ways, those scored in the newest."""
+        """Return groups of runs that are scored like the newest of their experiment, and runs that are left out."""
         right = runs.without(lambda run: None if self._at_scale(run) else "it was run at another scale")
         found, left_out = select(right, self.reference)
         newest: dict[str, str] = {}
@@ -178,7 +178,7 @@ class Settings:
 
 
 def _way(run: FinishedRun) -> str:
-    """Return a digest of everything that scores depend on, except what an experiment varies."""
+    """Return a digest of everything that scores depend on, except ``AXES``."""
     values = scored_values(run.results)
     return digest({key: value for key, value in values.items() if not AXES.match(key)})
 
@@ -246,22 +246,22 @@ class Measured:
         return "\n\n".join(part for part in parts if part)
 
     def with_kept(self, kept: Measured | None, experiments: Sequence[str]) -> Measured:
-        """Return these results with the entries of ``kept`` for places without one here, ordered by ``experiments``."""
+        """Return these results with those entries of ``kept`` that have no newer one here, see ``merged``."""
         old = () if kept is None else kept.entries
         return dataclasses.replace(self, entries=merged(old, self.entries, experiments))
 
 
 def merged(kept: Sequence[Entry], new: Sequence[Entry], experiments: Sequence[str]) -> tuple[Entry, ...]:
-    """Return the entries of ``experiments``, in that order; ``new`` ones replace ``kept`` ones at the same place."""
+    """Return the entries of ``experiments``, in that order; a ``new`` one replaces a ``kept`` one at the same place."""
     by_place = {entry.place: entry for entry in (*kept, *new)}
     known = [entry for entry in by_place.values() if entry.place[0] in experiments]
     return tuple(sorted(known, key=lambda entry: (experiments.index(str(entry.place[0])), *entry.place[1:])))
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """Return a Markdown table with the columns of all entries; cells that an entry lacks are empty.
+    """Return a Markdown table with the columns of all entries, those of the entry with the most columns first.
 
-    Columns are ordered as in the entry with the most columns.
+    Cells that an entry lacks are empty.
     """
     most = max((entry.cells for entry in entries), key=len)
     columns = list(dict.fromkeys([*most, *(column for entry in entries for column in entry.cells)]))
@@ -277,8 +277,7 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
     """Read results by row name; empty if the file does not exist.
 
     Raises:
-        UserError: its results are for another ``budget`` (scale); a page holds one scale, so writing it would lose
-            them.
+        UserError: its results are for another ``budget`` (scale), and would be lost if the page were written.
         ValueError: the file cannot be read as JSON.
     """
     if not file.is_file():

@@ -1,9 +1,10 @@
-"""The page of all experiments, with the command, the results of finished runs and the paper's numbers for each."""
+"""The page of all experiments: the command of each, the results of its finished runs, and the paper's numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,18 +40,17 @@ class Row:
     """One experiment on the page.
 
     Args:
-        title: the paper's name for it, and the section.
-        experiment: the file in conf/experiment; a row without its file is left out.
-        runs: the MLflow experiments of its runs.
+        title: what the paper calls it, and the section.
+        experiment: name of its file in conf/experiment; a row without its file is left out.
+        runs: the MLflow experiments that have its runs.
         layout: how the runs are shown, one of ``LAYOUTS``; null: by the ``document`` that they wrote.
-        document: a Markdown file written by runs, of which the newest is shown; null: there are only figures.
+        document: a Markdown file that its runs write; the newest is shown. Null: there are only figures.
         command: command that runs it; null: ``python -m src.main +experiment=<experiment>``.
         claims: entries of the paper's ``claims``.
         table: the paper's table to show next to ours.
-        differs: differences from the paper's setting.
-        needs: data that the project does not ship, which the page mentions if there are no runs.
-        elsewhere: place that the page of the documentation refers to instead of giving our numbers; empty: it gives
-            them.
+        differs: how its setting differs from the paper's.
+        needs: data that it needs and the project does not ship; the page names them if there are no runs.
+        elsewhere: where the documentation's page sends readers for our numbers; empty: it gives them itself.
 
     Raises:
         ValueError: the layout is unknown, has no runs, or is given together with a document.
@@ -82,7 +82,7 @@ class Row:
 
     @property
     def without_runs(self) -> str:
-        """Text in place of our numbers if there are no runs."""
+        """The text in place of our numbers if there are no runs."""
         if not self.runs and not self.document:
             return BY_FIGURES
         return f"{NOT_YET}, needs {self.needs}" if self.needs else NOT_YET
@@ -96,7 +96,7 @@ class Row:
 @validated
 @dataclass(frozen=True)
 class Experiments(Task):
-    """Write the page of experiments; ``+experiment=experiments_table``.
+    """``+experiment=experiments_table``: write the page of experiments.
 
     Args:
         rows: constructor arguments of each ``Row``, by row name.
@@ -121,14 +121,18 @@ class Experiments(Task):
         unknown = sorted(set(self.only or ()) - set(self.rows))
         if unknown:
             raise ValueError(f"experiments.only: no row {unknown}, want some of {', '.join(self.rows)}")
-        for row in (Row(**arguments) for arguments in self.rows.values()):
+        for row in self._rows.values():
             missing = [c for c in row.claims if c not in self.paper["claims"]]
             missing += [t for t in (row.table,) if t is not None and t not in self.paper["tables"]]
             if missing:
                 raise ValueError(f"experiments.rows, {row.experiment}: the paper's numbers have no {missing}")
         _ = self._tables
 
-    @property
+    @cached_property
+    def _rows(self) -> dict[str, Row]:
+        return {name: Row(**arguments) for name, arguments in self.rows.items()}
+
+    @cached_property
     def _tables(self) -> dict[str, Paper]:
         return {name: Paper(**table) for name, table in self.paper["tables"].items()}
 
@@ -140,12 +144,12 @@ class Experiments(Task):
     def write(self, uri: str, config: Mapping[str, Any], folder: Path) -> str:
         """Write experiments.md, experiments.json and figures, and the page if asked for.
 
-        The page is short: results by setting and object, and costs, are in the JSON file of the same name. Experiments
+        The page is short; results by setting and object, and costs, are in the JSON file of the same name. Experiments
         and settings without runs here keep their previous results, which are read from that file.
 
         Args:
             uri: address of the MLflow store.
-            config: configuration; only runs with its ``budget`` count, and its ``seed`` seeds the bootstrap.
+            config: the configuration; only runs with the same ``budget`` count, and ``seed`` seeds the bootstrap.
             folder: output folder.
 
         Returns:
@@ -153,8 +157,7 @@ class Experiments(Task):
         """
         budget = config["budget"]
         settings = Settings(uri, budget, self.reference, self.draws, config["seed"])
-        rows = {name: Row(**arguments) for name, arguments in self.rows.items()}
-        rows = {name: row for name, row in rows.items() if row.exists}
+        rows = {name: row for name, row in self._rows.items() if row.exists}
         asked = {name: row for name, row in rows.items() if self.only is None or name in self.only}
         found = {name: self._found(row, settings) for name, row in asked.items()}
         for name, (_, shown, _) in found.items():
@@ -182,7 +185,7 @@ class Experiments(Task):
     def _found(
         self, row: Row, settings: Settings
     ) -> tuple[Measured | None, Mapping[str, Any], list[LeftOut]]:
-        """Return the results of finished runs (None without any), their figures by name, and runs that do not count."""
+        """Return the results of finished runs, None if there are none, figures by name, and runs that do not count."""
         if row.document is not None:
             return newest_document(settings.uri, row.experiment, row.document, settings.budget), {}, []
         if row.layout is None:
@@ -202,12 +205,15 @@ class Experiments(Task):
         note = (
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "
-            "set, in points. Brackets are 95 % intervals over seeds and test images; of a single seed they are too "
+            "set, in points. Brackets are 95 % intervals over seeds and test images; those of a single seed are too "
             "narrow (docs/results.md, The same training again). NS is no optimisation, NSO is `baseline=neural_sim` "
             "at a row's commit, which before 3490cc4 was today's `neural_sim_derivative`. "
             "Line numbers are those of the paper's LaTeX source."
         )
-        written = f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. What has no runs there is kept."
+        written = (
+            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Experiments without runs there keep "
+            "their last results."
+        )
         return ["# Experiments", written, note]
 
     def _brief(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
@@ -247,14 +253,14 @@ class Experiments(Task):
         ]
         for name, row in rows.items():
             below = [made[name].below] if name in made and made[name].below else []
-            # Layouts show the paper's table next to ours themselves.
+            # Layouts show the paper's table themselves.
             if row.table and not (below and row.layout):
                 below.append(self._tables[row.table].markdown())
             if below:
                 parts += [f"## {name.replace('_', ' ')}", f"{row.title}.", *below]
         used = {row.table for row in rows.values()}
         others = [table for name, table in self._tables.items() if name not in used]
-        if others and set(rows) >= {name for name, row in self.rows.items() if Row(**row).exists}:
+        if others and set(rows) >= {name for name, row in self._rows.items() if row.exists}:
             parts += ["## Tables of the paper without an experiment here"]
             parts += [table.markdown() for table in others]
         return "\n\n".join(parts) + "\n"
@@ -273,14 +279,14 @@ class Experiments(Task):
 
 
 def _point(title: str, lines: Sequence[str]) -> str:
-    """Format one item of a list; several lines become nested items."""
+    """Format an item of a list; several lines become nested items."""
     if len(lines) == 1:
         return f"- **{title}**: {lines[0]}"
     return "\n".join([f"- **{title}**:", *(f"    - {line}" for line in lines)])
 
 
 def _to_first_table(text: str) -> str:
-    """Return the paragraphs of a document up to its first table, or all if it has none."""
+    """Return the paragraphs of a document up to and including its first table, or all if it has none."""
     parts = text.split("\n\n")
     first = next((number for number, part in enumerate(parts) if part.startswith("|")), len(parts))
     return "\n\n".join(parts[: first + 1])
