@@ -12,7 +12,7 @@ from composing import composed
 
 from neural_sim.main import UserError, context_of
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.studies.stress import linear, simplex
+from neural_sim.studies.stress import linear, sampling
 from neural_sim.studies.stress.cases import CASES, Check, Scope
 from neural_sim.studies.stress.suite import FAMILIES, Stress, failures, markdown, metrics, run_case, table
 from neural_sim.tasks.context import TaskFailure
@@ -76,6 +76,10 @@ def test_tables_and_metrics_name_what_failed():
     assert lines[1].split()[:3] == ["a/one", "2", "1"] and lines[2].split()[:3] == ["b/two", "1", "0"]
     assert lines[3].startswith("FAILED a/one: y")
     assert lines[4] == "3 checks in 2 cases, 1 failed, 1.8 s"
+    undefined = [*results, Check("w", math.nan, 1.0, case="a/one")]
+    assert metrics(undefined)["a/one/used"] == math.inf and "nan" not in table(undefined).splitlines()[1]
+    small = [Check("v", 0.5, 1.0, case="a/one"), Check("w", math.nan, 1.0, case="a/one")]
+    assert metrics(small)["a/one/used"] == math.inf, "0.5 would hide what is undefined"
     text = markdown(results)
     assert "**failed**" in text and r"\|x\|" in text
     found = metrics(results)
@@ -86,6 +90,7 @@ def test_bad_settings_name_their_key(tmp_path):
     for override, message in (
         ("stress.families=[x]", "stress.families"),
         ("stress.families=[]", "stress.families"),
+        ("stress.families=[linear,linear]", "stress.families"),
         ("+stress.speed=1", "stress.speed"),
     ):
         config = composed("+experiment=stress", override)
@@ -96,10 +101,10 @@ def test_bad_settings_name_their_key(tmp_path):
 
 
 def test_what_failed_is_counted_written_and_logged(context, monkeypatch):
-    monkeypatch.setattr(simplex, "project_sum", lambda values: values)
+    monkeypatch.setattr(sampling, "project_sum", lambda values: values)
     config = composed(
         "+experiment=stress",
-        "stress.families=[simplex]",
+        "stress.families=[sampling]",
         "progress=false",
         f"paths.mlflow={context.config['paths']['mlflow']}",
     )

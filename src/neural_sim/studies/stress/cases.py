@@ -1,4 +1,4 @@
-"""Inputs and outputs of the cases, and what they render: solids of constant density, and a small detector."""
+"""What the cases share: their inputs and outputs, solids of constant density, and a small detector."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DOUBLE, SINGLE = torch.float64, torch.float32
 class Scope:
     """Input of every case: the seed of its random problems, and whether heavy ones run at full size.
 
-    Tolerances are valid for every seed; each statistical check fails with probability below ``FALSE_ALARM``.
+    Tolerances are valid for every seed; a statistical check fails with a probability below ``FALSE_ALARM``.
     """
 
     seed: int = 0
@@ -45,8 +45,8 @@ class Scope:
 class Check:
     """One number compared with its bound: passes if ``value <= tolerance`` and the status is a wanted one.
 
-    ``value`` is an error (0 is perfect), ``tolerance`` the error that theory allows, ``wanted`` the correct statuses
-    (empty: the quantity has none). NaN never passes. The suite adds the case and the ``seconds`` it took.
+    ``value`` is an error (0 is perfect; NaN never passes), ``tolerance`` the error that theory allows, and ``wanted``
+    the correct statuses (empty: the quantity has none). The suite adds the case and the ``seconds`` that it took.
     """
 
     quantity: str
@@ -59,15 +59,15 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether value and status are right."""
+        """Whether the value and the status are right."""
         return self.value <= self.tolerance and (not self.wanted or self.status in self.wanted)
 
     @property
     def used(self) -> float:
-        """Fraction of the tolerance that the value uses up; above 1 the check has failed."""
+        """Fraction of the tolerance that the value uses up; above 1 the check has failed, infinite for NaN."""
         if self.value == 0.0:
             return 0.0
-        return self.value / self.tolerance if self.tolerance > 0.0 else math.inf
+        return math.inf if math.isnan(self.value) or self.tolerance <= 0.0 else self.value / self.tolerance
 
     def record(self) -> dict[str, Any]:
         """Return the check as JSON; undefined numbers are null."""
@@ -78,11 +78,11 @@ class Check:
 
 Checks = Iterator[Check]
 CASES: dict[str, Callable[[Scope], Checks]] = {}
-"""Every case by ``family/name``, in the order of definition."""
+"""Cases by ``family/name``, in the order of definition."""
 
 
 def case(function: Callable[[Scope], Checks]) -> Callable[[Scope], Checks]:
-    """Register a case under the names of its file and its function."""
+    """Register a case by the names of its file and its function."""
     CASES[f"{function.__module__.rsplit('.', 1)[-1]}/{function.__name__}"] = function
     return function
 
@@ -103,7 +103,7 @@ def not_finite(*tensors: Tensor) -> float:
 
 
 def short(dtype: torch.dtype) -> str:
-    """Return the name of a type without its module."""
+    """Return the name of a dtype without its module."""
     return str(dtype).removeprefix("torch.")
 
 
@@ -113,7 +113,7 @@ EXACT = NerfRenderer(termination=0.0)
 
 
 def raw_density(sigma: float, cell: float) -> float:
-    """Return the table entry whose softplus over the cell's edge is ``sigma``."""
+    """Return the table entry whose softplus, divided by the edge of a cell, is ``sigma``."""
     depth = sigma * cell
     return depth + math.log(-math.expm1(-depth)) if depth > 0.0 else EMPTY_DENSITY
 
@@ -168,7 +168,7 @@ def opacity_of(depth: Tensor | float) -> Tensor:
 
 
 def outside(opacity: Tensor, sigma: float, shortest: Tensor, longest: Tensor) -> float:
-    """Return by how much opacities leave the range for lengths from ``shortest`` to ``longest``."""
+    """Return by how much opacities leave the range of lengths from ``shortest`` to ``longest``; 0 if they do not."""
     low, high = opacity_of(sigma * shortest), opacity_of(sigma * longest)
     return float(torch.maximum(low - opacity.double(), opacity.double() - high).clamp_min(0.0).max())
 

@@ -32,7 +32,7 @@ def _peaked(depth: float) -> Tensor:
 def constant_scores(scope: Scope) -> Checks:
     """Estimate from equal scores: no bin is better, and the derivative is exactly 0.
 
-    Even rounding errors are not allowed: an update that normalises the gradient would turn them into a full step.
+    Not even rounding errors are allowed, since an update that normalises the gradient would make them a full step.
     """
     for value in (1.0, 0.1, -1e8, 1e-300, 1e100):
         scores = torch.full((len(KNOWN),), value, dtype=DOUBLE)
@@ -43,7 +43,7 @@ def constant_scores(scope: Scope) -> Checks:
                     f"stratified: score {value:g}, psi {depth:g}, {label}", worst(estimate.value), 0.0
                 )
         estimate = reinforce(scores, lambda psi: binned.log_probabilities(psi)[KNOWN], _peaked(1.7))
-        # Its baseline is a mean of all scores, known to n eps, times a slope of at most 1.
+        # Its baseline is the mean of all scores, known to n eps, and has a slope of at most 1.
         yield Check(
             f"reinforce: score {value:g}", worst(estimate.value), len(KNOWN) * eps(DOUBLE) * abs(value)
         )
@@ -93,7 +93,7 @@ def significance(scope: Scope) -> Checks:
         "one scene": no_difference(scores[None]),
         "a scene's scores equal under every light": no_difference(scores[:, None].expand(-1, 3)),
         "no rows but zeros": zero_mean(torch.zeros_like(rows)),
-        "one row beside zeros": zero_mean(torch.eye(BINS, dtype=DOUBLE)[:, :1] * rows[:1]),
+        "one row among zeros": zero_mean(torch.eye(BINS, dtype=DOUBLE)[:, :1] * rows[:1]),
         "a row of inf": zero_mean(rows.clone().index_fill_(0, torch.tensor(0), math.inf)),
     }
     for name, p_value in nothing.items():

@@ -102,8 +102,8 @@ def far_from_stationary(scope: Scope) -> Checks:
     """Solve at theta* + delta for |delta| from 0 to 1e6.
 
     The stationarity is |H delta|, and the implicit gradient is off by D^T A H^-1 B^T B delta / N, both closed forms.
-    The quantity states by how much it misses dL_val/dpsi at theta*. Rounding: N eps of the terms summed; the solve's
-    rtol and n^2 eps through |H^-1| onto the gradient.
+    The name of the quantity says how far it is from dL_val/dpsi at theta*. Rounding costs N eps for the summed terms;
+    the gradient also has the solve's error, rtol and n^2 eps times |H^-1|.
     """
     problem = Quadratic.random(scope)
     towards = torch.nn.functional.normalize(scope.normal(SIZE), dim=0)
@@ -131,7 +131,7 @@ def far_from_stationary(scope: Scope) -> Checks:
 
 @case
 def units(scope: Scope) -> Checks:
-    """Solve with L_train in another unit, which does not affect dL_val/dpsi; powers of two change no digit."""
+    """Solve with L_train in another unit, which dL_val/dpsi does not depend on; powers of two change no digit."""
     problem = Quadratic.random(scope)
     plain = problem.solved(problem.minimiser, ConjugateGradient(), 1e-10)
     for power in (-200, -60, 60, 200):
@@ -145,8 +145,8 @@ def units(scope: Scope) -> Checks:
 def degenerate(scope: Scope) -> Checks:
     """Solve flat inner problems, and losses that are NaN or overflow.
 
-    A flat problem without damping has no inverse: v must be 0, with a status; with lambda, v = b / lambda. For a loss
-    that is NaN or overflows, v must be 0, with a status.
+    A flat problem without damping has no inverse, so v must be 0 and the status must say so; with lambda, v is
+    b / lambda. For a loss that is NaN or overflows, v must be 0 and the status NON_FINITE.
     """
     b = scope.normal(SIZE)
     params = {"x": torch.ones(SIZE, dtype=DOUBLE)}
@@ -176,8 +176,8 @@ def degenerate(scope: Scope) -> Checks:
 def indefinite_hessians(scope: Scope) -> Checks:
     """Damp Hessians of any sign and condition by the default rule, with as many Lanczos steps as parameters.
 
-    The damping must pass the most negative eigenvalue by its margin (to the rounding n eps |H| of a Ritz value), and
-    the solve reach the dense one: condition of the damped matrix times rtol and n^2 eps.
+    The damping must exceed minus the most negative eigenvalue by its margin, up to the rounding n eps |H| of a Ritz
+    value. The solve must agree with the dense one up to the condition of the damped matrix times rtol and n^2 eps.
     """
     spectra = {
         "definite, condition 1e12": logarithmic(1e12),
@@ -206,11 +206,10 @@ def indefinite_hessians(scope: Scope) -> Checks:
 
 @case
 def untrained_detector(scope: Scope) -> Checks:
-    """Take the stationarity of a real detector at its random start, 10 times and 100 times that.
+    """Take the stationarity of a real detector at its random start, and at 10 and 100 times those parameters.
 
-    The truth is the directional derivative of the loss along the gradient itself, extrapolated from two central
-    differences (Richardson). The tolerance is that reference's own error: what the extrapolation changed, and eps L /
-    step.
+    The truth is the directional derivative of the loss along its gradient, extrapolated from two central differences
+    (Richardson). The tolerance is the error of this truth: what the extrapolation changed, and eps L / step.
     """
     detector = small_detector(2)
     start = {name: value.double() for name, value in detector.init(scope.generator()).items()}

@@ -1,8 +1,8 @@
-"""Linear systems, against closed forms in the eigenbasis or a solution chosen before its right-hand side.
+"""Linear systems whose solution is a closed form in the eigenbasis, or was chosen before the right-hand side.
 
 Notation: n unknowns, condition number k = |A| |A^-1|, eps of the arithmetic. A backward stable solver leaves a residual
 of at most n^2 eps |A| |x| (the worst-case constant of a dense factorisation; Higham, Accuracy and Stability, Thm.
-10.4), and ``|x - x*| <= |A^-1| |r|`` whatever the solver. No solver can be expected to do better.
+10.4), and for any solver ``|x - x*| <= |A^-1| |r|``. No solver can be expected to do better.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def backward_error(dtype: torch.dtype = DOUBLE) -> float:
 
 
 def krylov_steps(condition: float, rtol: float) -> int:
-    """Return the number of steps in which CG and MINRES must converge: twice the Chebyshev bound."""
+    """Return the number of steps in which CG and MINRES must converge: twice the Chebyshev bound, and 2 n more."""
     return math.ceil(math.sqrt(condition) * math.log(2.0 * math.sqrt(condition) / rtol)) + 2 * SIZE
 
 
@@ -104,13 +104,13 @@ def ended(quantity: str, value: float, tolerance: float, solution: Solution, *wa
 def condition_numbers(scope: Scope) -> Checks:
     """Solve for k from 1 to 1e12 in float64 and float32, to the residual of a backward stable solver.
 
-    ``|x - x*| / |x*| <= k (rtol |b| / (|A| |x*|) + n^2 eps)``: the residual asked for, and the rounding of ``A x*`` and
-    of the recomputed residual, n eps each. The rounding of MINRES' short recurrences reaches the residual as k^2 eps
-    (Sleijpen, van der Vorst and Modersitzki 2000): beyond k = 1 / sqrt(eps) it may stop with STAGNATED instead, no
-    worse than zero; LEAST_SQUARES would be a false claim here.
+    ``|x - x*| / |x*| <= k (rtol |b| / (|A| |x*|) + n^2 eps)`` is due to the residual asked for, and to the rounding of
+    ``A x*`` and of the recomputed residual, n eps each. The rounding of MINRES' short recurrences reaches the residual
+    as k^2 eps (Sleijpen, van der Vorst and Modersitzki 2000), so beyond k = 1 / sqrt(eps) it may stop with STAGNATED
+    and a residual no larger than that of zero; LEAST_SQUARES would be false.
 
-    float32 is compared with the float64 solution of the very same rounded system. Where its bound exceeds 1 no digit is
-    promised, and the claim must be honest: converged only if the float64 residual is below rtol and the rounding of one
+    float32 is compared with the float64 solution of the same rounded system. If its bound exceeds 1, no digit is
+    promised, but CONVERGED may be claimed only if the float64 residual is at most rtol plus the rounding of one
     product, n eps |A| |x| / |b|.
     """
     generator = scope.generator()
@@ -140,9 +140,9 @@ def condition_numbers(scope: Scope) -> Checks:
 def indefinite(scope: Scope) -> Checks:
     """Solve with eigenvalues of both signs, and all negative.
 
-    MINRES and the dense solve reach the bound of ``condition_numbers``. Conjugate gradients run over n A-conjugate
-    directions, among which as many have negative curvature as A has negative eigenvalues (Sylvester), so they must meet
-    one before they converge. What they hand back is no worse than zero, whose residual is 1.
+    MINRES and the dense solve reach the bound of ``condition_numbers``. The n A-conjugate directions of conjugate
+    gradients include as many of negative curvature as A has negative eigenvalues (Sylvester), so the solver meets one
+    before it converges. Its result is no worse than zero, whose residual is 1.
     """
     generator = scope.generator()
     signs = torch.ones(SIZE, dtype=DOUBLE)
@@ -167,13 +167,13 @@ def indefinite(scope: Scope) -> Checks:
 def singular(scope: Scope) -> Checks:
     """Solve with three zero eigenvalues.
 
-    With b in the range: the minimum-norm solution, from a closed form in the eigenbasis, by the bound of
-    ``condition_numbers``. Each step adds at most n eps |A| |x| outside it; divided by the smallest non-zero eigenvalue,
-    this is the same bound with the number of steps in place of n.
+    If b is in the range, the solution of minimum norm is a closed form in the eigenbasis, and is met to the bound of
+    ``condition_numbers``. Each step adds at most n eps |A| |x| outside the range; divided by the smallest non-zero
+    eigenvalue, this is the same bound with the number of steps in place of n.
 
-    With a part of b outside it, and for the zero operator: the least residual, |P_null b| / |b|. A minimal residual
-    depends on an error of x only to second order, so the same bound holds with room to spare. Solvers for definite
-    systems may not claim success, and do no worse than zero.
+    If a part of b is outside the range, the residual must be the least possible, |P_null b| / |b|. It depends on an
+    error of x only to second order, so the same bound holds with room to spare. Solvers for definite systems may not
+    claim success, and do no worse than zero. For the zero operator, the solution is 0.
     """
     condition, rank = 1e3, SIZE - 3
     values = torch.cat([logarithmic(condition, rank), torch.zeros(3, dtype=DOUBLE)])
@@ -207,7 +207,7 @@ def singular(scope: Scope) -> Checks:
 def units(scope: Scope) -> Checks:
     """Solve for b = 0, which gives exactly 0, and in other units.
 
-    Multiplying b or the operator by a power of two changes no digit of the solution, even where the squares of the
+    Multiplying b or the operator by a power of two changes no digit of the solution, even if the squares of the
     operator's entries leave the range of the arithmetic.
     """
     for dtype, powers in ((SINGLE, (-90, 90)), (DOUBLE, (-900, -600, 600, 900))):
@@ -230,10 +230,7 @@ def units(scope: Scope) -> Checks:
 
 @case
 def one_parameter(scope: Scope) -> Checks:
-    """Solve for one unknown: x = b / a to a few roundings.
-
-    This holds for any size of a and, with solvers that allow it, either sign.
-    """
+    """Solve for one unknown: x = b / a to a few roundings, for any size of a and, if solvers allow it, either sign."""
     b = torch.tensor([6.0], dtype=DOUBLE)
     for entry in (3.0, 1e-300, 1e-20, 1e20, 1e300, -3.0):
         for name in SOLVERS:
@@ -248,10 +245,9 @@ def one_parameter(scope: Scope) -> Checks:
 
 @case
 def non_finite_operators(scope: Scope) -> Checks:
-    """Solve with NaN and inf at once or only from the third product on, in b, and with overflow.
+    """Solve with NaN or inf in every product, NaN from the third product on, NaN in b, and products that overflow.
 
-    The solution must have a status, and every number in it must be finite. A bad warm start is dropped and costs
-    nothing.
+    The status must be NON_FINITE, and every number in the solution finite. A warm start with NaN changes nothing.
     """
     problem = system(logarithmic(1e3), scope.generator())
     plain, nothing = problem.matrix.mv, problem.b.clone()
@@ -268,7 +264,7 @@ def non_finite_operators(scope: Scope) -> Checks:
             "NaN in b": (plain, nothing),
             "overflow": (((problem.matrix * 1e38).float() * 100.0).mv, problem.b.float()),
         }
-        if name != "identity":  # which takes one product in all
+        if name != "identity":  # which takes a single product
             trials["NaN from the third product"] = (late(), problem.b)
         for label, (operator, b) in trials.items():
             solution = solver.solve(operator, b, rtol=1e-12)

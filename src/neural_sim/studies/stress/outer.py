@@ -53,7 +53,7 @@ RATES = (1e-6, 1e-3, 1.0, 1e3)
 
 @dataclass
 class Worst:
-    """The worst violations in a run: numbers not finite, steps beyond their bound, p off the simplex or the floor."""
+    """The worst violations in a run: numbers that are not finite, overlong steps, p off the simplex or floor."""
 
     not_finite: float = 0.0
     excess: float = 0.0
@@ -87,7 +87,7 @@ def slope(psi: Tensor, costs: Tensor) -> Tensor:
 def run(
     update: Update, psi: Tensor, gradients: Iterable[Callable[[Tensor], Tensor]], error: float, worst: Worst
 ) -> UpdateState:
-    """Step along gradients that depend on psi, with standard errors of a fraction ``error`` of their size."""
+    """Step along gradients that depend on psi; their standard errors are ``error`` times their size."""
     state = UpdateState.zeros(psi)
     for of in gradients:
         gradient = of(psi)
@@ -122,7 +122,7 @@ def learning_rates(scope: Scope) -> Checks:
 
 @case
 def flat_loss(scope: Scope) -> Checks:
-    """Step along a gradient of exactly zero, with any update, rate and psi: no digit changes."""
+    """Step along a gradient of exactly zero with every update, rate and psi: no digit changes."""
     for name, make in UPDATES.items():
         for rate in RATES:
             moved = 0.0
@@ -138,11 +138,11 @@ def flat_loss(scope: Scope) -> Checks:
 
 @case
 def cliff(scope: Scope) -> Checks:
-    """Step along a single gradient of 1e30 or more, infinity or NaN, among normal ones.
+    """Step along a single gradient of 1e-300 to 1e300, infinity or NaN, among normal ones.
 
     The step must be bounded, or refused and counted, and psi must stay finite and bounded in the next 30 steps. Up to
-    1e100 squares are finite and the step is taken; inf and NaN are refused; in between, squares overflow and either is
-    correct.
+    1e100, squares are finite and the step must be taken; inf and NaN must be refused. In between squares overflow, and
+    either is correct.
     """
     costs, shape = scope.normal(3, 8), scope.normal(3, 8)
     for name, make in UPDATES.items():
@@ -182,8 +182,8 @@ class Constant:
 def loop(scope: Scope) -> Checks:
     """Run the whole psi loop on a cube with 4 bins and an estimator that returns NaN, inf, 1e30 or 0.
 
-    Psi must be finite and within the bound of its steps. A zero or non-finite gradient must not move psi, and the
-    certificate of the latter must say what was done.
+    Psi must be finite and within the bound of its steps. A gradient that is 0 or not finite must not move psi, and the
+    certificate of one that is not finite must say what was done.
     """
     iterations = 2
     trials: tuple[tuple[float, OnUntrusted], ...] = (

@@ -1,14 +1,16 @@
-"""Draws from p_psi at extreme settings, against closed forms."""
+"""Draws from p_psi at extreme settings, and projections onto the simplex, against closed and exact solutions."""
 
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import torch
 from torch import Tensor
 
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.bins import BinNoise
+from neural_sim.parameter.distributions import project_simplex, project_sum
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.studies.stress.cases import (
@@ -41,8 +43,8 @@ def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
 def one_hot(scope: Scope) -> Checks:
     """Draw from psi = 1000 on one bin without a floor.
 
-    There p is exactly 1, log p elsewhere is -1000 up to a few roundings, every draw is from that bin (Gumbel noise
-    spans at most 31), and dp/dpsi = p (1 - p) = exp(-1000) underflows to 0.
+    Its p is exactly 1, log p elsewhere is -1000 up to a few roundings, every draw is from that bin (Gumbel noise spans
+    at most 31), and dp/dpsi = p (1 - p) = exp(-1000) underflows to 0.
     """
     scene = SceneDistribution.of([Pose(floor=0.0)])
     (pose,) = scene.binned
@@ -54,7 +56,7 @@ def one_hot(scope: Scope) -> Checks:
         hard, relaxed = scene.hard(psi, noise), scene.relaxed(psi, noise)
         missed = int((hard.bins != 5).sum()) + int((relaxed.bins != 5).sum())
         yield Check(f"draws of another bin, {short(dtype)}", float(missed), 0.0)
-        # One weight of exactly 1: the circular mean is its centre, through one sine, cosine and arctangent.
+        # With one weight of exactly 1, the circular mean is a bin's centre after one sine, cosine and arctangent.
         gap = torch.remainder(relaxed.phi.double() - hard.phi.double() + math.pi, CIRCLE) - math.pi
         yield Check(f"relaxed against hard angle, {short(dtype)}", worst(gap), 8 * eps(dtype) * CIRCLE)
         leaf = psi.clone().requires_grad_()
@@ -62,7 +64,7 @@ def one_hot(scope: Scope) -> Checks:
         yield Check(f"dp/dpsi, {short(dtype)}", worst(slope), 8 * eps(dtype))
     wanted = torch.eye(8, dtype=DOUBLE)[2]
     back = pose.log_probabilities(pose.psi_of(wanted)).exp()
-    # psi_of() clamps zeros to 1e-6, which the normalisation distributes
+    # psi_of() clamps zeros to 1e-6, which the normalisation distributes.
     yield Check("logits of a one-hot p", worst(back - wanted), 7.1e-6)
 
 
@@ -120,7 +122,7 @@ def temperatures(scope: Scope) -> Checks:
         yield Check(f"|y - 1/k| beyond the warm limit: {label}", excess, slack)
         single = binned.gumbel_softmax(log_p.float(), noise.float(), temperature)
         same = binned.gumbel_softmax(log_p.float().double(), noise.float().double(), temperature)
-        # y is at most 1, so an error above 1 says nothing; the draw's bin is checked by `gumbel_max`
+        # y is at most 1, so a bound above 1 says nothing; the draw's bin is checked by `gumbel_max`.
         bound = min(1.0, math.expm1(min(700.0, 4 * eps(SINGLE) * largest / temperature))) + count * eps(
             SINGLE
         )
@@ -161,10 +163,7 @@ def gumbel_max(scope: Scope) -> Checks:
 
 @case
 def bin_counts(scope: Scope) -> Checks:
-    """Draw from k of 1, 2 and 64 bins: hard draws lie in their bin, also at its very edges.
-
-    An angle at an edge lies in its bin up to the rounding of the angle, at most 4 eps 2 pi.
-    """
+    """Draw from 1, 2 and 64 bins: hard draws lie in their bin, up to the rounding of the angle at its very edges."""
     for dtype in (DOUBLE, SINGLE):
         for count in (1, 2, 64):
             scene = SceneDistribution.of([Pose(bins=count, floor=0.0)])
@@ -206,3 +205,63 @@ def opposite_bins(scope: Scope) -> Checks:
             yield Check(f"d angle / dy: {label}", worst(slope - exact), bound)
             yield Check(f"|d angle / dy| against 1 / cap: {label}", worst(slope), 1.0 / CAP + bound)
             yield Check(f"angles not finite: {label}", not_finite(angle), 0.0)
+
+
+# --- weights of lights ---
+
+
+def exact_projection(values: Tensor) -> list[float]:
+    """Project one vector without any rounding, from the optimality conditions of the quadratic programme.
+
+    These are ``w = max(v - t, 0)`` with the t that makes the sum 1. The sum falls as t grows, so t is the largest of
+    the thresholds given by the m largest entries, over all m.
+    """
+    entries = [Fraction(float(value)) for value in values]
+    ordered = sorted(entries, reverse=True)
+    threshold = max((sum(ordered[:m], Fraction(0)) - 1) / m for m in range(1, len(ordered) + 1))
+    return [float(max(entry - threshold, Fraction(0))) for entry in entries]
+
+
+def _extremes(dtype: torch.dtype, noise: Tensor) -> dict[str, Tensor]:
+    largest = torch.finfo(dtype).max
+    values = {
+        "a corner": [1.0, 0.0, 0.0],
+        "outside a corner": [3.0, -2.0, 0.1],
+        "just off a corner": [1.0 - 1e-6, 1e-6, -1e-6],
+        "an edge": [0.5, 0.5, -0.3],
+        "all equal": [0.7] * 7,
+        "ties at the threshold": [1.0, 0.0, 0.0, 0.0, -1.0],
+        "one weight": [-5.0],
+        "two huge ties": [1e30, 1e30, -1e30],
+        "one huge": [1e30, 1.0, 0.5],
+        "huge and negative": [-1e30, -1e30, -1e30, -1e30],
+        "the largest numbers": [largest, -largest, 0.0],
+        "tiny": [1e-30, -1e-30, 2e-30],
+        "near ties at 1e6": [1e6 + 0.25, 1e6, 1e6 - 0.5],
+        "64 weights": noise.tolist(),
+        "64 stiff weights": (noise * 10.0 ** (noise * 4)).tolist(),
+    }
+    return {label: torch.tensor(entries, dtype=dtype) for label, entries in values.items()}
+
+
+@case
+def projection(scope: Scope) -> Checks:
+    """Project weights of lights, and compare with the exact projection of the same floats in rational arithmetic.
+
+    After clamping, differences from the largest entry are at most 1 and are rounded once (eps / 2). Their sum over k
+    entries adds k eps, the threshold and the result one rounding each: (k + 4) eps in all. The weights then sum to
+    1 within k times that. The projection onto the plane of sum 1 is v - (mean(v) - 1 / k), whose mean and differences
+    round by k eps max|v| each, and k of them are summed.
+    """
+    for dtype in (DOUBLE, SINGLE):
+        for label, values in _extremes(dtype, scope.normal(64)).items():
+            weights, count = project_simplex(values), len(values)
+            truth = torch.tensor(exact_projection(values), dtype=DOUBLE)
+            name, bound = f"{label}, {short(dtype)}", (count + 4) * eps(dtype)
+            yield Check(f"error: {name}", worst(weights.double() - truth), bound)
+            outside = float(-weights.min().clamp_max(0.0))
+            wrong = abs(math.fsum(weights.tolist()) - 1.0) + outside
+            yield Check(f"distance to the simplex: {name}", wrong, count * bound)
+            wrong = abs(math.fsum(project_sum(values).tolist()) - 1.0)
+            largest = max(1.0, worst(values))
+            yield Check(f"sum - 1: {name}", wrong, 3 * count * eps(dtype) * largest * count)

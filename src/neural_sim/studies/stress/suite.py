@@ -1,4 +1,4 @@
-"""``+experiment=stress``: run families of stiff and extreme cases one after another, and report failures."""
+"""``+experiment=stress``: run stiff and extreme cases, family by family, and report what fails."""
 
 from __future__ import annotations
 
@@ -15,21 +15,26 @@ from annotated_types import MinLen
 from tqdm import tqdm
 
 from neural_sim.documents import markdown_table, write_whole
-from neural_sim.ranges import validated
+from neural_sim.ranges import Distinct, validated
 from neural_sim.studies.stress.cases import CASES, Check, Checks, Scope
 from neural_sim.tasks.context import Context, Task, TaskFailure
 
-Family = Literal["linear", "inner", "estimators", "sampling", "simplex", "rendering", "imaging", "outer"]
+Family = Literal["linear", "inner", "estimators", "sampling", "rendering", "outer"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
-"""Families, one file each, in the order of the psi loop; their cases are the functions marked ``@case``."""
+"""Families, one file each; their cases are the functions marked ``@case``."""
 
 
 @validated
 @dataclass(frozen=True)
 class Stress(Task):
-    """Run every case of ``families``; without ``full``, heavy cases run in a smaller version."""
+    """Run every case of some families.
 
-    families: Annotated[Sequence[Family], MinLen(1)] = FAMILIES
+    Args:
+        families: families to run, in this order.
+        full: whether heavy cases run at full size.
+    """
+
+    families: Annotated[Sequence[Family], MinLen(1), Distinct()] = FAMILIES
     full: bool = True
 
     def run(self, context: Context) -> None:
@@ -57,7 +62,7 @@ class Stress(Task):
 
 
 def run_case(name: str, scope: Scope) -> Checks:
-    """Yield the checks of a case as they come; a case that raises, or checks nothing, has failed."""
+    """Yield the checks of a case as they come; one that raises or checks nothing has failed."""
     checks, count = CASES[name](scope), 0
     while True:
         begin, ended = time.perf_counter(), True
@@ -77,7 +82,7 @@ def run_case(name: str, scope: Scope) -> Checks:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep warnings out of the log, since cases provoke them and check statuses instead."""
+    """Keep warnings out of the log; cases provoke them, and check statuses instead."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -99,7 +104,7 @@ def _by_case(checks: Sequence[Check]) -> dict[str, list[Check]]:
 
 
 def metrics(checks: Sequence[Check]) -> dict[str, float]:
-    """Return MLflow metrics: counts, and for each case failures, largest fraction of a tolerance used, and seconds."""
+    """Return MLflow metrics: counts, and each case's failures, largest fraction of a tolerance used, and seconds."""
     found = {"checks": float(len(checks)), "failed": float(len(failures(checks)))}
     for name, own in _by_case(checks).items():
         found |= {
@@ -111,7 +116,7 @@ def metrics(checks: Sequence[Check]) -> dict[str, float]:
 
 
 def table(checks: Sequence[Check]) -> str:
-    """Return one line per case (checks, largest fraction of a tolerance used, seconds), then the failures."""
+    """Return a line per case (checks, failures, largest fraction of a tolerance used, seconds), then the failures."""
     lines = [f"{'case':<38}{'checks':>7}{'failed':>7}{'used':>9}{'seconds':>9}"]
     for name, own in _by_case(checks).items():
         used = max(check.used for check in own)
