@@ -103,17 +103,13 @@ class FrozenLoop:
         return ProbeSet.draw(self.scene, self.detector, self.backbone, per_bin, self.psi, generator, objects)
 
     def truth(self, per_bin: int, generator: torch.Generator) -> list[MixedDerivative]:
-        """Estimate every object's derivative over hard bins, from ``per_bin`` images of each bin."""
-        return self.over_strata(self.probes(per_bin, generator))
-
-    def over_strata(self, probed: ProbeSet) -> list[MixedDerivative]:
-        """Return every object's stratified estimate, from the scores <dl/dtheta, v> of its probes in each bin."""
-        return [self._stratified(probed, label) for label in range(len(probed.probes))]
-
-    def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
-        probes = probed.probes[label][self.bins.name]
-        along = scores(probed.cached.losses, self.trainable, self.vector, probes.index).cpu()
-        return by_strata(along, self.bins, self.psi[label].float())
+        """Estimate every object's derivative over hard bins, from the scores of ``per_bin`` images of each bin."""
+        probed, found = self.probes(per_bin, generator), []
+        for label, probes in enumerate(probed.probes):
+            index = probes[self.bins.name].index
+            along = scores(probed.cached.losses, self.trainable, self.vector, index).cpu()
+            found.append(by_strata(along, self.bins, self.psi[label].float()))
+        return found
 
     def pathwise(
         self, estimator: PathwiseEstimator, count: int, generator: torch.Generator
@@ -122,7 +118,7 @@ class FrozenLoop:
         rendered = self.scene.training_set(self.psi, count, generator, estimator.draws)
         images = rendered.images
         targets = self.detector.assign(images.boxes, images.labels)
-        losses = Losses(_unavailable, image_losses(self.detector, self.backbone, targets))
+        losses = Losses(unavailable, image_losses(self.detector, self.backbone, targets))
         # The weights of an object's images sum to 1.
         weights = torch.full((len(images),), len(rendered.objects) / len(images))
         parts = object_images(self.scene, rendered, self.psi, weights).values()
@@ -170,5 +166,11 @@ def centred(derivatives: list[MixedDerivative]) -> Float[Tensor, "objects k"]:
     return values - values.mean(-1, keepdim=True)
 
 
-def _unavailable(*_: object) -> NoReturn:
-    raise AssertionError("a pathwise estimator asked for losses from cached features")
+def relative_error(value: Tensor, truth: Tensor) -> Tensor:
+    """Return |value - truth| / |truth| along the last axis."""
+    return (value - truth).norm(dim=-1) / truth.norm(dim=-1)
+
+
+def unavailable(*_: object) -> NoReturn:
+    """Stand in for losses that an estimator does not need."""
+    raise AssertionError("an estimator asked for losses of a kind that it does not need")

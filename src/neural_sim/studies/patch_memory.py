@@ -24,7 +24,7 @@ from neural_sim.parameter.product import HARD
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
-from neural_sim.studies.frozen_loop import FrozenLoop, pathwise_of
+from neural_sim.studies.frozen_loop import FrozenLoop, pathwise_of, relative_error
 from neural_sim.synthesis.assembly import RenderedObject, one_each
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import Maps
@@ -182,9 +182,7 @@ def _generator(seed: int) -> torch.Generator:
 
 
 def _apart(values: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> float:
-    """Return |values - truth| / |truth|."""
-    one, other = (torch.cat([each[name] for name in truth]) for each in (values, truth))
-    return float((one - other).norm() / other.norm())
+    return float(relative_error(*(torch.cat([each[name] for name in truth]) for each in (values, truth))))
 
 
 def publish(context: Context, rows: Sequence[PatchCost], setting: str) -> Run | None:

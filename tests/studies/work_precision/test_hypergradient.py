@@ -22,8 +22,8 @@ from neural_sim.studies.work_precision.hypergradient import (
     DEFAULT,
     EXACT,
     Hypergradients,
+    centred_error,
     correlation,
-    relative_error,
     slopes,
     ways,
 )
@@ -92,10 +92,10 @@ def test_places_are_those_that_the_loop_came_to(monkeypatch):
     assert all(torch.equal(psi, PSI.flip(0)) for psi in seen)
 
 
-def test_relative_error_leaves_means_out():
+def test_centred_error_leaves_means_out():
     truth = torch.tensor([[3.0, -3.0], [0.0, 0.0]])
-    assert relative_error(truth + 7.0, truth) == 0.0
-    assert relative_error(2.0 * truth, truth) == pytest.approx(1.0)
+    assert centred_error(truth + 7.0, truth) == 0.0
+    assert centred_error(2.0 * truth, truth) == pytest.approx(1.0)
 
 
 def test_ways_see_the_same_images_probes_and_training(monkeypatch):

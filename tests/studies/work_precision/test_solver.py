@@ -10,11 +10,13 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.damping import FixedDamping
 from neural_sim.solver.direct import Identity
 from neural_sim.solver.minres import MinimumResidual
+from neural_sim.studies.stress.linear import relative
 from neural_sim.studies.work_precision import solver as family
 from neural_sim.studies.work_precision.measurement import Timing
-from neural_sim.studies.work_precision.solver import Inverse, Oracle, Solver, product_problem, relative
+from neural_sim.studies.work_precision.solver import Inverse, Oracle, Solver, product_problem
 
 SOLVERS = {
     "cg": AdjointSolver(), "minres": AdjointSolver(MinimumResidual()), "identity": AdjointSolver(Identity()),
@@ -86,6 +88,21 @@ def test_the_default_is_the_solver_as_it_is_configured(inverse):
     assert error["cg, rtol 1e-09"] < 1e-9 * 20 and error["cg, graph built anew, rtol 1e-09"] < 1e-9 * 20
     # Differences of gradients are known to eps^(2/3) = 4e-11, times the condition number.
     assert error["cg, central differences, rtol 1e-09"] < 1e-7
+
+
+def test_a_solver_with_another_damping_says_so():
+    """Its error is that of another system, as measured at the lambda of the default."""
+    problem = Quadratic()
+    solvers = {
+        "cg": AdjointSolver(damping=FixedDamping(0.5, 0)),
+        "more": AdjointSolver(damping=FixedDamping(2.0, 0)),
+    }
+    inverse = Inverse.of(problem.inner, problem.validation, Timing(1), 0)
+    own = next(iter(Solver(solvers, rtols=(1e-9,), steps=(1,), conditions=())._inverse(inverse)))
+    details = {point.setting: point.detail for point in own.points}
+    assert (
+        details["more, rtol 1e-09"].endswith(", at lambda = 2") and "lambda" not in details["cg, rtol 1e-09"]
+    )
 
 
 def test_linear_systems_are_solved_to_their_tolerance_times_the_condition():

@@ -1,1 +1,1 @@
-"""Error against run time, the evidence behind the defaults; a key of the settings is a family, in a file of its own."""
+"""Study ``work_precision``: error against run time, the evidence behind the defaults."""

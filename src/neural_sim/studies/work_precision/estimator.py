@@ -1,16 +1,15 @@
-"""Estimators of the hypergradient's mixed term against the derivative over hard bins, by images and seconds.
+"""Estimators of the hypergradient's mixed term compared with the derivative over hard bins, by images and seconds.
 
-Each gives d/dpsi <dL_train/dtheta, v> of one object's psi from N images, drawn and bound as in the psi loop. The
-reference is g_i = p_i (s_i - sum_j p_j s_j), up to the floor's factor, where s_b is the mean score <dl/dtheta, v> of
-bin b. It is the derivative of the distribution that training images are drawn from, and an estimate, too, from other
-images.
+Each estimates d/dpsi <dL_train/dtheta, v> for one object's psi from N images, drawn as in the psi loop. The reference
+is g_i = p_i (s_i - sum_j p_j s_j), up to the floor's factor, where s_b is the mean score <dl/dtheta, v> of bin b. It
+differentiates the very distribution that training images are drawn from, but is an estimate, too, from its own images.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import torch
@@ -24,38 +23,21 @@ from neural_sim.gradient.estimators import Estimator, ReinforceEstimator, Strati
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.update import shrinkage
 from neural_sim.ranges import Ascending, PositiveInt, validated
-from neural_sim.studies.frozen_loop import FrozenLoop, centred
+from neural_sim.studies.frozen_loop import FrozenLoop, centred, relative_error, unavailable
 from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 from neural_sim.types import SceneDraw
 
 Estimates = Float[Tensor, "repeats objects k"]
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A pathwise estimator, with the matching settings of other packages."""
-
-    estimator: PathwiseEstimator
-    bin_mean: str = "circular"
-
-    def of(self, loop: FrozenLoop) -> FrozenLoop:
-        """Return the same state with these settings."""
-        return loop.with_factor(dataclasses.replace(loop.bins, bin_mean=self.bin_mean))
+Result = dict[int, tuple[Estimates, float]]
+"""Estimates and seconds per object, by number of images."""
 
 
 PATHWISE = {
-    "paper (reverse, linear)": Variant(PathwiseEstimator("reverse"), "linear"),
-    "linear": Variant(PathwiseEstimator(), "linear"),
-    "circular": Variant(PathwiseEstimator()),
+    "paper (reverse, linear)": (PathwiseEstimator("reverse"), "linear"),
+    "linear": (PathwiseEstimator(), "linear"),
+    "circular": (PathwiseEstimator(), "circular"),
 }
-
-
-@dataclass
-class Result:
-    """Results of one estimator: estimates, and seconds per object, by number of images."""
-
-    estimates: dict[int, Estimates] = field(default_factory=dict)
-    seconds: dict[int, float] = field(default_factory=dict)
+"""Pathwise estimators by name, with the ``bin_mean`` of the factor."""
 
 
 @validated
@@ -65,8 +47,9 @@ class Estimators:
 
     Args:
         images: numbers N of images per estimate, increasing, each a multiple of the first.
-        default: number of images of the default, the stratified estimator: 24 probes in each of 8 bins.
-        repeats: number of estimates from the largest N; there are more from smaller N.
+        default: number of images of the default, the stratified estimator: 24 probes in each of 8 bins. It is measured
+            in addition to ``images``.
+        repeats: number of estimates from the largest N; there are more of smaller N.
         truth_per_bin: images per bin for the reference.
         pathwise: variants of the pathwise estimator, from ``PATHWISE``.
 
@@ -102,19 +85,19 @@ class Estimators:
         found["reinforce"] = self._reinforce(loop, timing, seed)
         cosines = ", ".join(f"{ceiling:.2f}" for ceiling in ceilings(truth, noise))
         note = (
-            f"The derivative by the centred logits of {', '.join(world.names)}, of the validation loss, "
-            f"v {loop.solve}. Reference: {self.truth_per_bin} images of every bin; the exact vector would have a "
-            f"cosine of {cosines} with it. Seconds are per object: drawing, rendering, the estimate."
+            f"The derivative of the validation loss with respect to the centred logits of {', '.join(world.names)} "
+            f"(adjoint solve: {loop.solve}). The reference is from {self.truth_per_bin} images of every bin; the exact "
+            f"derivative has an expected cosine of {cosines} with it. Seconds are per object, for drawing, rendering "
+            "and estimating."
         )
         for kind, error in (
             ("relative error", relative_error),
             ("1 - cosine", lambda a, b: 1.0 - cosine(a, b)),
         ):
             points = tuple(
-                Point(f"{name}, {count} images", float(error(result.estimates[count], truth).mean()),
-                      result.seconds[count], None, name == "stratified" and count == self.default, name,
-                      self._spread(error(result.estimates[count], truth)))
-                for name, result in found.items() for count in result.estimates
+                Point(f"{name}, {count} images", float(error(estimates, truth).mean()), seconds, None,
+                      name == "stratified" and count == self.default, name, self._spread(error(estimates, truth)))
+                for name, result in found.items() for count, (estimates, seconds) in result.items()
             )  # fmt: skip
             yield Series(f"estimator/{kind}", f"{kind} of the estimate", points, (), note, timing.clock)
 
@@ -128,35 +111,36 @@ class Estimators:
     def _pathwise(self, loop: FrozenLoop, name: str, timing: Timing, seed: int) -> Result:
         """Estimate with equal seeds, so that variants with the same draws see the same images.
 
-        Images are independent, so that estimates from more images are means of estimates from the smallest number.
+        Images are independent, so estimates from more of them are means of estimates from the smallest number.
         """
-        variant, unit = PATHWISE[name], self.images[0]
-        # Reverse mode gives the numbers of the row "linear" up to rounding, so one repeat is enough for its time.
-        repeats = 1 if variant.estimator.mode == "reverse" else self.repeats
-        moved, generator, units = variant.of(loop), torch.Generator().manual_seed(seed + 100), []
+        (estimator, bin_mean), unit = PATHWISE[name], self.images[0]
+        # Reverse mode gives the same numbers as "linear" up to rounding; one repeat is enough to time it.
+        repeats = 1 if estimator.mode == "reverse" else self.repeats
+        moved = loop.with_factor(dataclasses.replace(loop.bins, bin_mean=bin_mean))
+        generator, units = torch.Generator().manual_seed(seed + 100), []
         begun = timing.now()
         for _ in range(repeats * self.images[-1] // unit):
-            units.append(centred(moved.pathwise(variant.estimator, unit, generator)))
+            units.append(centred(moved.pathwise(estimator, unit, generator)))
         spent = (timing.now() - begun) / (len(units) * unit * len(loop.psi))
         stacked, result = torch.stack(units), Result()
         for count in self.images:
             size = count // unit
-            result.estimates[count] = stacked[: len(units) // size * size].unflatten(0, (-1, size)).mean(1)
-            result.seconds[count] = spent * count
+            means = stacked[: len(units) // size * size].unflatten(0, (-1, size)).mean(1)
+            result[count] = means, spent * count
         return result
 
     def _stratified(self, loop: FrozenLoop, timing: Timing, seed: int) -> dict[str, Result]:
-        """Estimate from disjoint subsets of a pool of every bin, as is and with the shrinkage of the psi update."""
+        """Estimate from disjoint parts of a pool of every bin, without and with the psi update's shrinkage."""
         bins = loop.scene.distribution.size
         counts = sorted({*self.images, self.default})
         pool = self.repeats * max(2, counts[-1] // bins)
         begun = timing.now()
         probed = loop.probes(pool, torch.Generator().manual_seed(seed + 31))
         image = (timing.now() - begun) / len(probed.cached)
-        probes, plain, shrunk = [part[loop.factor.name] for part in probed.probes], Result(), Result()
+        probes, plain, shrunk = [part[loop.bins.name] for part in probed.probes], Result(), Result()
         for count in counts:
             per_bin, values, kept = count // bins, [], []
-            if per_bin < 2:  # the noise of a single image is unknown
+            if per_bin < 2:  # a single image has no measurable noise
                 continue
             begun = timing.now()
             for first in range(0, pool - per_bin + 1, per_bin):
@@ -171,12 +155,11 @@ class Estimators:
                 kept.append(values[-1] * shrinkage(values[-1], noise))
             spent = (timing.now() - begun) / (len(values) * len(probes))
             for result, estimates in ((plain, values), (shrunk, kept)):
-                result.estimates[count] = torch.stack(estimates)
-                result.seconds[count] = image * count + spent
+                result[count] = torch.stack(estimates), image * count + spent
         return {"stratified": plain, "stratified, shrunk": shrunk}
 
     def _reinforce(self, loop: FrozenLoop, timing: Timing, seed: int) -> Result:
-        """Estimate from disjoint subsets of hard draws of every object."""
+        """Estimate from disjoint parts of a pool of hard draws of every object."""
         pool = self.repeats * self.images[-1]
         begun = timing.now()
         rendered = loop.scene.training_set(loop.psi, pool, torch.Generator().manual_seed(seed + 41))
@@ -193,36 +176,27 @@ class Estimators:
                 parts = [score(loop, ReinforceEstimator(), cached, p, label) for label, p in enumerate(drawn)]
                 found.append(centred(parts))
             spent = (timing.now() - begun) / (len(found) * len(rendered.objects))
-            result.estimates[count], result.seconds[count] = torch.stack(found), image * count + spent
+            result[count] = torch.stack(found), image * count + spent
         return result
 
 
 def score(
     loop: FrozenLoop, estimator: Estimator, cached: CachedSet, drawn: Probes, label: int
 ) -> MixedDerivative:
-    """Estimate from the scores of some of the cached images; their pixels are not needed."""
+    """Estimate from the scores of some of the cached images, without their pixels."""
     count = len(drawn.index)
     still = torch.zeros(count)
     images = ObjectImages(
         loop.psi[label].float(), loop.scene.distribution, torch.zeros(count, 3, 1, 1), drawn.index,
         torch.full((count,), 1.0 / count), SceneDraw(still, still, still, drawn.bins[:, None]),
     )  # fmt: skip
-    losses = Losses(cached.losses, _unavailable, cached.losses)
-    return estimator.estimate(losses, loop.trainable, loop.vector, images, {loop.factor.name: drawn})
-
-
-def _unavailable(*_: object) -> Tensor:
-    raise RuntimeError("an estimator asked for losses as functions of pixels, which it has no use for")
+    losses = Losses(cached.losses, unavailable, cached.losses)
+    return estimator.estimate(losses, loop.trainable, loop.vector, images, {loop.bins.name: drawn})
 
 
 def cosine(a: Tensor, b: Tensor) -> Tensor:
     """Return the cosine along the last axis; 0 where an estimate is zero."""
     return torch.nn.functional.cosine_similarity(a, b, dim=-1, eps=1e-30)
-
-
-def relative_error(a: Tensor, b: Tensor) -> Tensor:
-    """Return |a - b| / |b| along the last axis."""
-    return (a - b).norm(dim=-1) / b.norm(dim=-1)
 
 
 def ceilings(value: Float[Tensor, "objects k"], standard_error: Float[Tensor, "objects k"]) -> list[float]:

@@ -11,11 +11,11 @@ from neural_sim.ranges import Positive, validated
 from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 
 SCHEDULES = ("refine_steps", "prune_steps")
-"""Arguments of a fitting that are step numbers, and scale with the number of steps."""
+"""Arguments of a fitting that are numbers of steps, and change in proportion to all steps."""
 
 
 def scaled(recipe: FieldRecipe, part: float) -> FieldRecipe:
-    """Return the recipe with ``part`` times its steps, and the steps at which its structure changes in proportion."""
+    """Return the recipe with ``part`` times as many steps; its structure changes at proportionally moved steps."""
     fitting = recipe.fitting
     if isinstance(fitting, functools.partial):
         moved = {
@@ -34,11 +34,11 @@ class Fields:
 
     Args:
         recipes: recipes of fields, by name.
-        parts: numbers of steps by the same names, as multiples of the recipe's.
+        parts: numbers of steps as multiples of each recipe's own, by the same names.
         default: the default among ``recipes``, with all of its steps.
 
     Raises:
-        ValueError: the names differ, or the default is not among them.
+        ValueError: the names of ``recipes`` and ``parts`` differ, or the default is not among them.
     """
 
     recipes: Mapping[str, FieldRecipe] = field(default_factory=dict)
@@ -53,7 +53,7 @@ class Fields:
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Fit the first object of the run; wall-clock seconds of training, without the renders that score it."""
+        """Fit the run's first object, and take wall-clock seconds of training, without the renders that score it."""
         del timing, seed  # a fit records its own time, and its recipe has its own seed
         views, points = world.views, []
         for name, recipe in self.recipes.items():
@@ -69,8 +69,8 @@ class Fields:
             height, width = views.images.shape[1:3]
             note = (
                 f"{world.names[0]}, {len(views) - world.held_out} views of {width} x {height} pixels, scored on "
-                f"{world.held_out} others; every row is a fit of its own, scheduled for so many steps. "
-                "Seconds on the wall."
+                f"{world.held_out} others. Every row is a fit of its own, whose schedule has that number of steps. "
+                "Wall-clock seconds."
             )
             yield Series("field/held-out views", "root mean square error of held-out pixels", tuple(points), (), note,
                          "seconds")  # fmt: skip

@@ -1,7 +1,7 @@
-"""The hypergradient of the training that was run, by each adjoint, compared with the response of training.
+"""The hypergradient of the training that was run, by every adjoint, compared with the response of training.
 
 The response (``outer.response``) is a finite difference: it repeats the training with a fraction of an object's images
-moved to one bin, under common random numbers. Derivatives are compared with it as vectors over the bins of an object.
+moved to one bin, under common random numbers. It and the derivatives are compared as vectors over an object's bins.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from neural_sim.outer.settings import Outer
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.direct import Identity
+from neural_sim.studies.frozen_loop import relative_error
 from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 
 _log = logging.getLogger(__name__)
 Slopes = Float[Tensor, "objects K"]
 Place = Literal["start", "first_step", "end"]
-"""Places in a psi loop: the start, psi after the first step that moved it, and the end."""
+"""Places in a psi loop: the start, after the first step that moved psi, and the end."""
 DEFAULT = "unrolled, as configured"
 EXACT = "unrolled, exact products, all probes every step"
 
 
 @dataclass(frozen=True)
 class Way:
-    """An adjoint, given by the settings of the loop and the solver, with its line in the figure."""
+    """An adjoint, as settings of the loop and the solver, and its line in the figure."""
 
     line: str
     outer: Outer
@@ -47,7 +48,7 @@ class Way:
 
 
 def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
-    """Return every adjoint by name, as a change of the configured settings."""
+    """Return every adjoint by name, as changes to the configured settings."""
 
     def unrolled(line: str, **changed: object) -> Way:
         own = outer.adjoint if isinstance(outer.adjoint, Unrolled) else Unrolled()
@@ -78,14 +79,19 @@ class Hypergradients:
     """The family ``hypergradient``.
 
     Args:
-        trainings: number of trainings, with different seeds, whose derivatives are taken.
+        trainings: number of trainings, each with its own seed, whose derivatives are taken.
         solver: the default solver, for implicit adjoints.
-        places: places in the psi loop; all except the start run the loop first.
+        places: places in the psi loop; for all but the start, the loop is run first.
     """
 
     trainings: PositiveInt = 2
     solver: AdjointSolver = field(default_factory=AdjointSolver)
     places: Annotated[Sequence[Place], MinLen(1)] = ("start",)
+
+    @property
+    def after_start(self) -> bool:
+        """Whether the loop has to be run."""
+        return any(place != "start" for place in self.places)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
         """Measure at every place that the loop reaches."""
@@ -93,12 +99,12 @@ class Hypergradients:
         for place in self.places:
             psi = None if place == "start" else world.visited.get(place)
             if psi is None and place != "start":
-                _log.warning("work_precision.hypergradient: no step moved psi, there is no %s", place)
+                _log.warning("work_precision.hypergradient.places: no step moved psi, %s is left out", place)
                 continue
             yield from self._at(place, psi, world, seed)
 
     def _at(self, place: Place, psi: Slopes | None, world: World, seed: int) -> Iterator[Series]:
-        """Compare every way with the response of the same training, and unrolled ones with the exact derivative."""
+        """Compare every way with the response of the same training, and the unrolled ones with the exact derivative."""
         named, truths = ways(world.outer, self.solver), []
         responses: dict[str, list[tuple[float, float]]] = {name: [] for name in named}
         exact: dict[str, list[tuple[float, float]]] = {
@@ -113,21 +119,21 @@ class Hypergradients:
                 # Rounding may push a correlation beyond 1.
                 responses[name].append((max(0.0, 1.0 - correlation(value, truth)), seconds))
                 if name in exact:
-                    exact[name].append((relative_error(value, found[EXACT][0]), seconds))
+                    exact[name].append((centred_error(value, found[EXACT][0]), seconds))
         both = [correlation(a, b) for a, b in combinations(truths, 2)]
         again = f"; the responses of two trainings correlate by {fmean(both):.2f}" if both else ""
         where = (
             f"{', '.join(world.names)} at the loop's {place.replace('_', ' ')}, {self.trainings} training(s)"
         )
-        seconds = "Seconds on the wall, without the training itself."
+        seconds = "Wall-clock seconds, without the training itself."
         more = "" if place == "start" else f", {place.replace('_', ' ')}"
         yield Series(
             f"hypergradient/of a training{more}", "1 - correlation with the response", _points(responses, named), (),
-            f"{where}; against the response of training, by bins{again}. {seconds}", "seconds",
+            f"{where}; compared over bins with the response of training{again}. {seconds}", "seconds",
         )  # fmt: skip
         yield Series(
             f"hypergradient/unrolled{more}", "relative error of the derivative", _points(exact, named), (),
-            f"{where}; against exact Hessian products of all probes in every step. {seconds}", "seconds",
+            f"{where}; compared with exact Hessian products of all probes in every step. {seconds}", "seconds",
         )  # fmt: skip
 
 
@@ -143,9 +149,9 @@ def _points(
 
 
 def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
-    """Return slopes of scores with respect to the fraction of images moved to each bin, and the time they took.
+    """Return slopes of scores in the fraction of images that is moved to each bin, and the seconds they took.
 
-    Images, training and probes are the same for all ways: common random numbers, and a generator with the same seed.
+    All ways have the same images, training and probes, because random numbers are common and generators start alike.
     """
     generator = torch.Generator().manual_seed(loop.numbers.generator.initial_seed())
     inner = replace(loop.inner, settings=way.outer)
@@ -156,14 +162,14 @@ def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
     return -slope / p, sum(found.seconds.values())
 
 
-def relative_error(found: Slopes, truth: Slopes) -> float:
+def centred_error(found: Slopes, truth: Slopes) -> float:
     """Return |found - truth| / |truth| after subtracting the mean over each object's bins."""
-    value, wanted = (each - each.mean(-1, keepdim=True) for each in (found, truth))
-    return float((value - wanted).norm() / wanted.norm())
+    value, wanted = ((each - each.mean(-1, keepdim=True)).flatten() for each in (found, truth))
+    return float(relative_error(value, wanted))
 
 
 def correlation(found: Slopes, truth: Slopes) -> float:
-    """Return the correlation over bins, averaged over objects; 0 for an object whose slopes vanish in either."""
+    """Return the mean over objects of the correlation over bins, which is 0 where either one's slopes are equal."""
     each = [centred_cosine(a, b) for a, b in zip(found, truth, strict=True)]
     return fmean(0.0 if math.isnan(value) else value for value in each)
 

@@ -1,7 +1,7 @@
 """What every family of measurements reads and yields.
 
-Inputs are the fields, the detector and the psi loop of a run, from the store or made on demand. Outputs are series:
-settings of one computation with their errors and run times, some of them Pareto-optimal.
+It reads the fields, the detector and the psi loop of a run, and yields series: settings of one computation with their
+errors and run times, some of which are Pareto-optimal.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ T = TypeVar("T")
 Clock = Literal["cpu_seconds", "seconds"]
 """CPU time of all threads, which other work on the machine hardly affects, or wall-clock time."""
 CLEARLY = 0.9
-"""A setting beats a default if it takes less than this fraction of its time; timings vary by a few percent."""
+"""A setting beats a default if it takes at most this fraction of its time; timings vary by a few percent."""
 RECORDED = 0.1
-"""Longest run, in seconds, whose memory is measured; recording the allocations of longer ones takes gigabytes."""
+"""Seconds of the longest run whose memory is measured; recording the allocations of longer ones takes gigabytes."""
 SHORTEST = 0.05
-"""Shortest time, in seconds, that is measured; shorter runs are repeated to fill it."""
+"""Seconds of the shortest measurement; shorter runs are repeated to fill it."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Point:
         error: nonnegative error, of the kind that the series names.
         seconds: run time by the clock of the series.
         memory_mb: peak memory of tensors in MiB; None if it was not measured.
-        default: whether this is the default setting.
-        line: name of the line in the figure, which joins settings that differ in one number.
+        default: whether it is the default setting.
+        line: name of its line in the figure; a line joins settings that differ in one number.
         detail: further text for the table.
     """
 
@@ -77,7 +77,7 @@ class Order:
 class Series:
     """Settings of one computation whose errors and run times can be compared.
 
-    ``name`` starts with the family and a slash. ``note`` says what was measured, and against which reference.
+    ``name`` starts with the family and a slash. ``note`` says what was measured, and what it was compared with.
 
     Raises:
         ValueError: there is no point, two have the same setting, or an error or a time is negative.
@@ -109,9 +109,10 @@ class Series:
         return pareto([(point.error, point.seconds) for point in self.points])
 
     def overtaken(self) -> Iterator[tuple[Point, Point]]:
-        """Yield every default that is beaten by more than the noise of timings, with the fastest setting that beats it.
+        """Yield every default that is beaten, with the fastest setting that beats it.
 
-        A setting beats the default if its error is not larger and it takes at most ``CLEARLY`` of its time.
+        A setting beats the default if its error is not larger and its time is shorter by more than the noise of
+        timings, see ``CLEARLY``.
         """
         for mine in self.points:
             ahead = [o for o in self.points if o.error <= mine.error and o.seconds <= CLEARLY * mine.seconds]
@@ -120,9 +121,9 @@ class Series:
 
 
 def pareto(costs: Sequence[tuple[float, float]]) -> tuple[bool, ...]:
-    """Return which pairs are not dominated by another, that is, no larger in both numbers and smaller in one.
+    """Return which pairs are optimal: no other pair is at most as large in both numbers and smaller in one.
 
-    Pairs that contain NaN or infinity are never optimal and dominate nothing.
+    A pair with NaN or infinity is never optimal, and other pairs are optimal regardless of it.
     """
     usable = [all(math.isfinite(value) for value in pair) for pair in costs]
     return tuple(
@@ -141,7 +142,7 @@ def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
 def slope(steps: Sequence[float], errors: Sequence[float]) -> float:
     """Return the least-squares slope of log ``errors`` over log ``steps``.
 
-    It is NaN if an error is 0 or not finite, there are fewer than two, or all steps are equal.
+    It is NaN if an error is 0 or not finite, if there are fewer than two errors, or if all steps are equal.
 
     Raises:
         ValueError: the sequences have different lengths, or a step is not positive.
@@ -179,7 +180,7 @@ class Timing:
     def of(self, run: Callable[[], object], device: torch.device | None = None) -> tuple[float, float | None]:
         """Return seconds and peak memory (MiB) of ``run``; memory is measured in a separate run that is not timed.
 
-        A run that takes less than ``SHORTEST`` is repeated to fill that time, and the mean is returned. Memory is None
+        A run that takes less than ``SHORTEST`` is repeated to fill that time in each of the ``repeats``. Memory is None
         if a run takes longer than ``RECORDED``.
         """
         first = self.once(run, device)[0]
@@ -212,11 +213,11 @@ class World:
     @property
     def held_out(self) -> int:
         """The number of held-out views."""
-        return self.context.experiment.imaging.views.held_out
+        return self.context.graph.views[0].held_out
 
     @property
     def loop(self) -> FrozenLoop:
-        """The psi loop at its start, with v solved by the run's solver."""
+        """The psi loop frozen at its start, with v from the run's solver."""
         return FrozenLoop.of(self.context, self.context.experiment.run.seed)
 
     @property
@@ -240,11 +241,7 @@ class World:
             ValueError: the method does not follow the hypergradient.
         """
         stage = self.context.graph.learned
-        if stage.parts is None:
-            raise ValueError(
-                f"work_precision: want a method that follows the hypergradient, got {stage.method.name}"
-            )
-        parts = dataclasses.replace(stage.parts, solver=solver)
+        parts = None if stage.parts is None else dataclasses.replace(stage.parts, solver=solver)
         initial = stage.initial if psi is None else psi
         other = dataclasses.replace(stage, outer=outer, parts=parts, seed=seed, initial=initial)
         loop = other.loop(self.context.results)

@@ -1,10 +1,10 @@
-"""Error of the volume rendering quadrature against samples per ray, for smooth, sharp and thin densities.
+"""Error of the volume rendering quadrature by samples per ray, for smooth, sharp and thin densities.
 
 Theory for a step h: the midpoint rule is of second order if density and colour are smooth (Davis and Rabinowitz,
 Methods of Numerical Integration), and of first order if the density jumps, since a jump at a random place in a cell
-misplaces up to h/2 of the density. One random sample per interval makes 1/h independent errors of size h^2, so that
-their root mean square is of order 3/2 (Haber 1966), and of first order at a jump. A shell thinner than the step is hit
-or missed, so that there is no order until the step resolves it.
+misplaces up to h/2 of the density. One random sample per interval makes 1/h independent errors of size h^2, whose root
+mean square is of order 3/2 (Haber 1966); at a jump, it is of first order, too. A shell thinner than the step is either
+hit or missed, so there is no order until the step resolves it.
 """
 
 from __future__ import annotations
@@ -25,23 +25,24 @@ from neural_sim.studies.work_precision.measurement import Order, Point, Series, 
 SPAN = 2.0
 """Length of every ray in object radii: the diameter of the unit sphere."""
 FINER = 16
-"""Samples of the reference, as a multiple of the finest setting's."""
+"""Number of samples of the reference, as a multiple of the finest setting's."""
 AT_ONCE = 1 << 18
 """Number of reference samples composited at a time."""
 WIDE, THICKNESS = 0.6, 0.02
-"""Mean thickness over rays of the sharp box and of the thin shell, in object radii."""
+"""Thickness of the sharp box and of the thin shell in object radii, the mean over rays."""
 DEPTH = 1.0
-"""Mean optical depth over rays of both."""
+"""Optical depth of both, the mean over rays."""
 RULES = ("midpoint", "jittered")
+AtLeastTwo = Annotated[int, Ge(2)]
 
 Along = Float[Tensor, "rays samples"]
 
 
 @dataclass(frozen=True)
 class Density:
-    """A density along rays at distances from 0 to ``SPAN``, displaced by each ray's ``offset`` in [0, 1).
+    """A density along rays at distances from 0 to ``SPAN``, displaced on each ray by its ``offset`` in [0, 1).
 
-    ``resolved`` is the largest step for which theory gives an order; ``midpoint`` and ``jittered`` are the orders.
+    ``midpoint`` and ``jittered`` are the orders of the two rules in theory, for steps up to ``resolved``.
     """
 
     sigma: Callable[[Along, Along], Along]
@@ -50,12 +51,12 @@ class Density:
     resolved: float = SPAN
 
     def order(self, rule: str) -> float:
-        """Return the order of a rule."""
+        """Return the order of a rule in theory."""
         return self.midpoint if rule == "midpoint" else self.jittered
 
 
 def _blob(distance: Along, offset: Along) -> Along:
-    """Return a Gaussian that is nonzero at both ends of the ray; one that vanishes there is integrated too well."""
+    """Return a Gaussian that is nonzero at both ends of the ray, since one that vanishes there converges faster."""
     return 3.0 * torch.exp(-(((distance - 0.9 - 0.2 * offset) / 0.7) ** 2))
 
 
@@ -64,7 +65,7 @@ def box(
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
     """Return where a box of about this thickness starts and ends on each ray.
 
-    Both ends vary independently: with the same thickness on all rays, the errors at the two jumps would cancel for some
+    Both ends vary independently. With the same thickness on all rays, the errors at the two jumps would cancel for some
     steps and add up for others.
     """
     begin = 0.6 + 0.2 * offset
@@ -127,11 +128,11 @@ class Quadrature:
 
     Args:
         samples: numbers of samples per ray, increasing.
-        default: the default number: one per cell of a grid field along the diameter of the unit sphere.
-        rays: number of rays through each density, at random places.
+        default: the default number, which is one per cell of a grid field along the diameter of the unit sphere.
+        rays: number of rays through each density, at random offsets.
     """
 
-    samples: Annotated[tuple[Annotated[int, Ge(2)], ...], MinLen(2), Ascending(strictly=True)] = (
+    samples: Annotated[tuple[AtLeastTwo, ...], MinLen(2), Ascending(strictly=True)] = (
         16,
         32,
         64,
@@ -140,8 +141,8 @@ class Quadrature:
         512,
         1024,
     )
-    default: Annotated[int, Ge(2)] = 128
-    rays: Annotated[int, Ge(2)] = 256
+    default: AtLeastTwo = 128
+    rays: AtLeastTwo = 256
 
     @property
     def counts(self) -> list[int]:
@@ -149,7 +150,7 @@ class Quadrature:
         return sorted({*self.samples, self.default})
 
     def measure(self, world: object, timing: Timing, seed: int) -> Iterator[Series]:
-        """Measure root mean square errors over rays, of opacity and of colour, in float64."""
+        """Measure root mean square errors of opacity and of colour over rays, in float64."""
         del world  # this family has its own densities
         for name, density in DENSITIES.items():
             offset = torch.rand(self.rays, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -162,7 +163,7 @@ class Quadrature:
                     orders.append(self._order(density, rule, [row[place].error for row in rows]))
                 yield Series(
                     f"quadrature/{name}, {kind}", f"root mean square error of {kind}", tuple(points), tuple(orders),
-                    f"{self.rays} rays of 2 object radii, float64, against {FINER * self.counts[-1]} samples per ray.",
+                    f"{self.rays} rays of 2 radii, in float64; compared with {FINER * self.counts[-1]} samples a ray.",
                     timing.clock,
                 )  # fmt: skip
 
@@ -185,7 +186,7 @@ class Quadrature:
         return rows
 
     def _order(self, density: Density, rule: str, errors: list[float]) -> Order:
-        """Fit the order over the finer half of the steps that resolve the density; coarser ones are not asymptotic."""
+        """Fit the order to the finer half of the steps that resolve the density; coarser ones are not asymptotic."""
         steps = [SPAN / count for count in self.counts]
         kept = [(h, error) for h, error in zip(steps, errors, strict=True) if h <= density.resolved]
         kept = kept[len(kept) // 2 :] if len(kept) > 4 else kept

@@ -1,9 +1,10 @@
-"""Output of ``+experiment=work_precision``: a document, tables, figures, and sections of a documentation page."""
+"""The output of ``+experiment=work_precision``: a document, tables, figures, and sections of a documentation page."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,12 @@ from neural_sim.studies.work_precision.measurement import Point, Series
 from neural_sim.tasks.context import Context
 
 INTRODUCTION = (
-    "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}. *Optimal*: no other setting "
-    "of the table has a smaller error in less time. MB is the most that tensors took at one time."
+    "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}. A setting is *optimal* if "
+    "every other one in the table has a larger error or takes longer. MB is the peak memory of tensors."
 )
 MACHINE = "{clock} of {processor}, torch {torch}, {threads} thread(s), load {load:.1f}."
 SECTION = "<!-- begin: Error against run time: "
-CLOCKS = {"cpu_seconds": "Processor seconds", "seconds": "Seconds on the wall"}
+CLOCKS = {"cpu_seconds": "CPU seconds", "seconds": "Wall-clock seconds"}
 Row = Mapping[str, Any]
 
 
@@ -35,15 +36,8 @@ def document(series: Sequence[Series], machine: Mapping[str, Any]) -> dict[str, 
     rows, orders, overtaken = [], [], []
     for each in series:
         for point, best in zip(each.points, each.pareto, strict=True):
-            rows.append({
-                "name": each.name, "setting": point.setting, "error": point.error, "error_kind": each.error_kind,
-                "seconds": point.seconds, "memory_mb": point.memory_mb, "default": point.default, "pareto": best,
-                "line": point.line, "detail": point.detail,
-            })  # fmt: skip
-        orders += [
-            {"name": each.name, "line": o.line, "observed": o.observed, "theory": o.theory, "steps": o.steps}
-            for o in each.orders
-        ]
+            rows.append({"name": each.name, "error_kind": each.error_kind, **asdict(point), "pareto": best})
+        orders += [{"name": each.name, **asdict(order)} for order in each.orders]
         overtaken += [
             {"name": each.name, "default": mine.setting, "by": other.setting,
              "error_ratio": _ratio(mine.error, other.error), "seconds_ratio": _ratio(mine.seconds, other.seconds)}
@@ -62,7 +56,7 @@ def _ratio(mine: float, other: float) -> float | None:
 
 def markdown(held: Mapping[str, Any], family: str) -> str:
     """Return the tables and observed orders of one family, from the content of the JSON file."""
-    names = [name for name in held["measured"] if name.partition("/")[0] == family]
+    names = _names(held, family)
     clock = CLOCKS[held["measured"][names[0]]["clock"]]
     parts = [INTRODUCTION.format(clock=clock, **held["machine"])]
     for name in names:
@@ -74,12 +68,12 @@ def markdown(held: Mapping[str, Any], family: str) -> str:
 
 
 def brief(held: Mapping[str, Any], family: str) -> str:
-    """Return one short table for a family: the default of each series, and the nearest setting of every other line.
+    """Return a short table for a family: each series' default, and the setting nearest in time on every other line.
 
-    Nearest means in run time. Series without a default are left out if others have one. For series without other
-    lines, the Pareto-optimal settings are shown. A note shared by several series appears once.
+    Series without a default are left out if others have one. For series without other lines, the Pareto-optimal
+    settings are shown. A note shared by several series appears once.
     """
-    names = [name for name in held["measured"] if name.partition("/")[0] == family]
+    names = _names(held, family)
     decided = [name for name in names if any(row["default"] for row in held["series"] if row["name"] == name)]
     names = decided or names
     parts = [MACHINE.format(clock=CLOCKS[held["measured"][names[0]]["clock"]], **held["machine"])]
@@ -102,6 +96,10 @@ def brief(held: Mapping[str, Any], family: str) -> str:
     parts += [f"Observed orders of convergence (in theory): {'; '.join(orders)}."] if orders else []
     parts += [_overtaken(each) for each in held["overtaken"] if each["name"].partition("/")[0] == family]
     return "\n\n".join(parts)
+
+
+def _names(held: Mapping[str, Any], family: str) -> list[str]:
+    return [name for name in held["measured"] if name.partition("/")[0] == family]
 
 
 def _short(row: Row) -> str:
@@ -175,10 +173,9 @@ def _overtaken(each: Row) -> str:
 
 
 def figure(series: Series) -> Figure:
-    """Draw error against run time on logarithmic axes.
+    """Draw error against run time on logarithmic axes; an error of 0 is drawn at the lower edge.
 
     Lines join settings that differ in one number, Pareto-optimal settings are filled, and a ring marks the default.
-    Errors of 0 are drawn at the lower edge.
     """
     made = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = made.add_subplot()
@@ -199,7 +196,7 @@ def figure(series: Series) -> Figure:
     axes.set_axisbelow(True)
     figures.style(axes)
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        if high < 100.0 * low:  # fewer than two powers of ten, which would be the only labels
+        if high < 100.0 * low:  # powers of ten alone would give fewer than two labels
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(NullFormatter())
@@ -230,7 +227,7 @@ def slug(name: str) -> str:
 
 
 def text_of(held: Mapping[str, Any]) -> str:
-    """Return the sections of all families, from the content of the JSON file."""
+    """Return work_precision.md, from the content of the JSON file."""
     sections = [f"## {family}\n\n{markdown(held, family)}" for family in _families(held)]
     return "\n\n".join(["# Error against run time", *sections])
 
@@ -240,9 +237,9 @@ def _families(held: Mapping[str, Any]) -> list[str]:
 
 
 def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
-    """Rewrite the sections of ``page``, see ``documents.replace_section``; a page without any gets all families.
+    """Rewrite the sections of ``page`` (``documents.replace_section``); a page without sections gets all families.
 
-    The page has the ``brief`` tables; the full tables of every family go to the JSON file of the same name.
+    The page has the ``brief`` tables, and the JSON file of the same name the full tables of every family.
     """
     file = page.with_suffix(".json")
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
@@ -256,14 +253,14 @@ def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
 
 
 def publish(context: Context, series: Sequence[Series], held: Mapping[str, Any]) -> Run | None:
-    """Write work_precision.json, work_precision.md and a figure a series, and log the defaults to MLflow."""
+    """Write work_precision.json, work_precision.md and a figure per series, and log the defaults to MLflow."""
     metrics = {}
     for each in series:
+        name = slug(each.name)
         for point in each.points:
             if point.default:
-                metrics[f"{slug(each.name)}/default_error"] = point.error
-                metrics[f"{slug(each.name)}/default_seconds"] = point.seconds
-        metrics[f"{slug(each.name)}/defaults_not_optimal"] = float(len(list(each.overtaken())))
-        metrics |= {f"{slug(each.name)}/order_{slug(order.line)}": order.observed for order in each.orders}
+                metrics |= {f"{name}/default_error": point.error, f"{name}/default_seconds": point.seconds}
+        metrics[f"{name}/defaults_not_optimal"] = float(len(list(each.overtaken())))
+        metrics |= {f"{name}/order_{slug(order.line)}": order.observed for order in each.orders}
     drawn = {slug(each.name): figure(each) for each in series}
     return context.publish("work_precision", held, text_of(held), drawn, metrics)

@@ -1,6 +1,6 @@
 """The inverse-Hessian product by every solver, damping and product mode, compared with dense references.
 
-The detector is small enough for a dense Hessian, and trained on two objects.
+It is that of a detector trained on two objects, which is small enough for a dense Hessian.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from neural_sim.solver.base import Solution
 from neural_sim.solver.damping import FixedDamping
 from neural_sim.solver.direct import Exact
 from neural_sim.solver.hvp import HessianOperator, Term, gradient
+from neural_sim.studies.stress.linear import logarithmic, relative, system
 from neural_sim.studies.work_precision.measurement import Point, Series, Timing, World
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import Scene
@@ -62,10 +63,9 @@ def small_scene() -> Scene:
 
 
 def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[InnerProblem, list[Term]]:
-    """Train a detector on ``images`` of each object; return its inner problem and L_val.
+    """Train a detector on ``images`` of each object, and return its inner problem and L_val in float64.
 
-    The inner problem has one image per bin and object, weighted by the probability of the bin divided by the number of
-    objects. Both are in float64.
+    The inner problem has one image per bin and object, weighted by the bin's probability over the number of objects.
     """
     generator, scene = torch.Generator().manual_seed(0), small_scene()
     detector = make(num_classes=2, image_size=SIZE)
@@ -95,12 +95,12 @@ def as_double(params: Params) -> Params:
 UNKNOWNS = 200
 """Size of the linear systems with a given condition number."""
 TIGHT = 1e-12
-"""Tolerance of solves with a given number of steps, small enough never to end them early."""
+"""Tolerance of solves with a given number of steps, which is too small to end them early."""
 
 
 @dataclass(frozen=True)
 class Product:
-    """How a Hessian product is computed; the fields of ``AdjointSolver``."""
+    """How a Hessian product is computed, as fields of ``AdjointSolver``."""
 
     mode: str
     retain_graph: bool
@@ -129,7 +129,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Oracle:
-    """Eigenvalues (growing) and eigenvectors of the dense Hessian, and the right-hand side in their basis."""
+    """Ascending eigenvalues and the eigenvectors of the dense Hessian, and the right-hand side in their basis."""
 
     values: Float[Tensor, "n"]
     vectors: Float[Tensor, "n n"]
@@ -156,13 +156,13 @@ class Inverse:
     b: Float[Tensor, "n"]
     oracle: Oracle
     seconds: float
-    """Time that the eigenvalues of the dense reference took."""
+    """Seconds that the eigenvalues of the dense Hessian took."""
     timing: Timing
     seed: int
 
     @staticmethod
     def of(problem: InnerProblem, validation: list[Term], timing: Timing, seed: int) -> Inverse:
-        """Decompose the Hessian of a problem, for the gradient of ``validation``."""
+        """Decompose the Hessian of a problem; the gradient of ``validation`` is the right-hand side."""
         params, terms = problem.params, problem.terms()
         b = gradient(validation, params)
         spent, oracle = timing.once(lambda: Oracle.of(terms, params, b))
@@ -174,19 +174,18 @@ class Inverse:
         return solver.damping.choose(solver.operator(self.terms, self.params), self.b, random).value
 
     def series(self, name: str, settings: Sequence[Setting], damping: float, more: str) -> Series:
-        """Solve with every setting, and compare with the dense solution at the same damping."""
-        truth = self.oracle.solve(damping)
-        points = tuple(self._point(setting, truth) for setting in settings)
+        """Solve with every setting, and compare with the dense solution at this damping."""
+        points = tuple(self._point(setting, damping) for setting in settings)
         low, high = (float(self.oracle.values[place]) + damping for place in (0, -1))
         condition = high / low if low > 0.0 else math.inf
         note = (
-            f"(H + lambda I)^-1 dL_val/dtheta of a detector of {self.b.numel()} trained numbers after its training, "
-            f"float64, lambda = {damping:.3g} (eigenvalues {low:.2g} to {high:.3g}, condition {condition:.3g}); "
-            f"against the dense matrix, whose eigenvalues take {self.seconds:.3g} s.{more}"
+            f"(H + lambda I)^-1 dL_val/dtheta of a trained detector with {self.b.numel()} parameters, in float64, with "
+            f"lambda = {damping:.3g} (eigenvalues {low:.2g} to {high:.3g}, condition {condition:.3g}); compared with "
+            f"the dense solution, whose eigenvalues take {self.seconds:.3g} s.{more}"
         )
         return Series(f"solver/{name}", "relative error of the product", points, (), note, self.timing.clock)
 
-    def _point(self, setting: Setting, truth: Tensor) -> Point:
+    def _point(self, setting: Setting, damping: float) -> Point:
         def solve():
             generator = torch.Generator().manual_seed(self.seed)
             return setting.solver.solve(self.terms, self.params, self.b, None, generator)
@@ -196,9 +195,9 @@ class Inverse:
         products = found.solution.products + (spectrum.products if spectrum else 0)
         seconds, memory = self.timing.of(solve)
         detail = f"{products} products, {_words(found.solution)}"
-        if found.damping_raises:  # it solved a different system from the reference
-            detail += f", lambda raised to {found.damping.value:.3g}"
-        error = relative(found.solution.value, truth)
+        if not math.isclose(found.damping.value, damping, rel_tol=1e-3):  # it solved another system
+            detail += f", at lambda = {found.damping.value:.3g}"
+        error = relative(found.solution.value, self.oracle.solve(damping))
         return Point(setting.name, error, seconds, memory, setting.default, setting.line, detail)
 
 
@@ -212,15 +211,16 @@ class Solver:
     """The family ``solver``.
 
     Args:
-        solvers: solvers by name; the dense one is the reference and not among them.
-        detector: makes the detector of the solves, small enough for a dense Hessian.
-        timed: makes the detector whose Hessian products are timed.
+        solvers: solvers by name, without the dense one, which is the reference.
+        detector: makes the detector of the solves, small enough for a dense Hessian; null: no solves.
+        timed: makes the detector whose Hessian products are timed; null: no products.
         default: the default among ``solvers``.
         rtols: relative residuals of solves that choose their own damping, in addition to the configured one.
         steps: numbers of steps of solves with a given damping.
-        factors: multiples of the damping that the default chooses; one series each.
+        factors: the given dampings, as multiples of the one that the default chooses; one series each.
         conditions: condition numbers of linear systems; one series each.
-        images: number of images for ``timed``, at ``size`` pixels a side.
+        images: number of images in a Hessian product of ``timed``.
+        size: side of these images in pixels.
 
     Raises:
         ValueError: the default is unknown.
@@ -240,11 +240,11 @@ class Solver:
     def __post_init__(self) -> None:
         if self.default not in self.solvers:
             raise ValueError(
-                f"work_precision.solver.default must be one of {', '.join(self.solvers)}, got {self.default!r}"
+                f"work_precision.solver.default: want one of {', '.join(self.solvers)}, got {self.default!r}"
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Measure on the detector of ``micro``, on linear systems, and products of the run's kind of detector."""
+        """Measure solves for ``detector`` and of linear systems, and Hessian products of ``timed``."""
         del world  # this family has its own problems
         if self.detector is not None:
             yield from self._inverse(Inverse.of(*trained_problem(self.detector), timing, seed))
@@ -255,11 +255,13 @@ class Solver:
 
     def _inverse(self, problem: Inverse) -> Iterator[Series]:
         chosen = problem.chosen(self.solvers[self.default])
-        more = " Each chooses its lambda itself, from products that count; a solve starts from these."
+        more = (
+            " Each setting chooses its own lambda, from products that count and that the solve starts from."
+        )
         yield problem.series("damping of its own", list(self._own()), chosen, more)
         for factor in self.factors:
             value = factor * chosen
-            more = f" This lambda, {factor:g} times what the default chooses, is given; no product is spent on it."
+            more = f" This lambda is given: {factor:g} times the one that the default chooses, at no cost."
             yield problem.series(f"lambda {value:.3g} given", list(self._given(value)), value, more)
 
     def _given(self, value: float) -> Iterator[Setting]:
@@ -289,35 +291,29 @@ class Solver:
 
     def _system(self, condition: float, timing: Timing, seed: int) -> Series:
         """Solve systems with log-spaced eigenvalues from 1 to 1 / condition, constructed from a known solution."""
-        generator = torch.Generator().manual_seed(seed)
-        basis, _ = torch.linalg.qr(torch.randn(UNKNOWNS, UNKNOWNS, generator=generator, dtype=torch.float64))
-        truth = torch.randn(UNKNOWNS, generator=generator, dtype=torch.float64)
-        values = torch.logspace(0.0, -math.log10(condition), UNKNOWNS, dtype=torch.float64)
-        matrix = basis * values @ basis.T
-        matrix = 0.5 * (matrix + matrix.T)
-        b, points = matrix @ truth, []
+        problem = system(logarithmic(condition, UNKNOWNS), torch.Generator().manual_seed(seed))
+        points = []
         for name, solver in {**self.solvers, "dense": AdjointSolver(Exact())}.items():
             for rtol in (1e-2, 1e-6, 1e-10) if name not in ("dense", "identity") else (1e-10,):
 
                 def solve(linear=solver.linear, rtol: float = rtol):
-                    return linear.solve(matrix.mv, b, rtol=rtol, max_steps=10 * UNKNOWNS)
+                    return problem.solve(linear, rtol, 10 * UNKNOWNS)
 
                 found = solve()
                 seconds, memory = timing.of(solve)
                 detail = f"{found.products} products, {_words(found)}"
                 setting = name if name in ("dense", "identity") else f"{name}, rtol {rtol:g}"
-                points.append(
-                    Point(setting, relative(found.value, truth), seconds, memory, False, name, detail)
-                )
+                error = relative(found.value, problem.x)
+                points.append(Point(setting, error, seconds, memory, False, name, detail))
         note = (
-            f"{UNKNOWNS} unknowns, float64, eigenvalues spread evenly in log from 1 to {1.0 / condition:.0e}; an rtol "
+            f"{UNKNOWNS} unknowns, float64, eigenvalues spread evenly in log from 1 to {1.0 / condition:.0e}; rtol "
             "allows an error of rtol times the condition number."
         )
         name = f"solver/condition {condition:.0e}"
         return Series(name, "relative error of the solution", tuple(points), (), note, timing.clock)
 
     def _products(self, make: Callable[..., Detector], timing: Timing, seed: int) -> Series:
-        """Multiply by the Hessian on cached features in float32, against the exact product in float64."""
+        """Multiply by the Hessian on cached features in float32, and compare with the exact product in float64."""
         terms, params, precise = product_problem(make, self.images, self.size, seed)
         vector = gradient(terms, params)
         truth = HessianOperator(precise, as_double(params))(vector.double())
@@ -331,24 +327,19 @@ class Solver:
                 Point(name, error, seconds, memory, own, "products", f"{seconds / plain:.1f} gradients")
             )
         note = (
-            f"A Hessian product on {self.images} images of {self.size} px with cached features, {vector.numel()} "
-            "trained numbers, float32, against float64. A kept graph takes one gradient with its graph beforehand, "
-            "and the memory of all images as long as it is kept, which MB does not count."
+            f"A Hessian product on {self.images} images of {self.size} px with cached features and {vector.numel()} "
+            "parameters, in float32, compared with float64. A kept graph takes a gradient beforehand, and the memory "
+            "of all images while it is kept; neither is counted."
         )
         return Series(
             "solver/one product", "relative error of the product", tuple(points), (), note, timing.clock
         )
 
 
-def relative(value: Float[Tensor, "n"], truth: Float[Tensor, "n"]) -> float:
-    """Return |value - truth| / |truth|."""
-    return float((value - truth).norm() / truth.norm())
-
-
 def product_problem(
     make: Callable[..., Detector], images: int, size: int, seed: int
 ) -> tuple[list[Term], Parameters, list[Term]]:
-    """Return loss terms of an untrained detector on random pictures of a box, its parameters, and float64 terms."""
+    """Return the loss terms and parameters of an untrained detector on random pictures, and the terms in float64."""
     generator, detector = torch.Generator().manual_seed(seed), make(num_classes=6, image_size=size)
     backbone, params = detector.split(detector.init(generator))
     corner = 0.5 * size * torch.rand(images, 1, 2, generator=generator)

@@ -1,4 +1,4 @@
-"""``+experiment=work_precision``: error against run time, the evidence behind the defaults."""
+"""``+experiment=work_precision``: error against run time, the evidence behind the defaults, family by family."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import Annotated, Any, Literal, get_args
 from annotated_types import MinLen
 from typing_extensions import override
 
-from neural_sim.ranges import PositiveInt, validated
+from neural_sim.ranges import Distinct, PositiveInt, validated
 from neural_sim.report.provenance import machine
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Stage
+from neural_sim.studies.frozen_loop import check_comparable
 from neural_sim.studies.work_precision.estimator import Estimators
 from neural_sim.studies.work_precision.field import Fields
 from neural_sim.studies.work_precision.hypergradient import Hypergradients
@@ -28,15 +29,15 @@ from neural_sim.tasks.context import Context, Task
 _log = logging.getLogger(__name__)
 Name = Literal["quadrature", "field", "solver", "hypergradient", "estimator"]
 FAMILIES: tuple[Name, ...] = get_args(Name)
-"""Families in the order of the psi loop; each is a key of the settings."""
+"""Families in the order of the psi loop."""
 COMMAND = "python -m src.main +experiment=work_precision"
-"""Command shown in the sections of a documentation page; it runs at the scale ``quick``, at which they are made."""
+"""Command shown in the sections of a documentation page, which are made at the scale ``quick``."""
 READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
     "field": lambda graph: graph.views,
     "hypergradient": lambda graph: [graph.warm_start, graph.targets],
     "estimator": lambda graph: [graph.warm_start, graph.targets],
 }
-"""Stages that each family reads."""
+"""Stages that families read."""
 
 
 @validated
@@ -45,18 +46,18 @@ class WorkPrecision(Task):
     """``+experiment=work_precision``: measure error against run time, family by family.
 
     Args:
-        families: which of the other keys are measured, in this order.
+        families: the families to measure, in this order.
         repeats: number of timings; their median is reported.
         clock: ``cpu_seconds`` of CPU time, or ``seconds`` of wall-clock time.
         docs: a Markdown page whose sections on the measured families are rewritten; null: none.
-        quadrature: settings of a family.
+        quadrature: settings of the family of this name.
         fits: settings of the family ``field``.
-        solver: likewise.
-        hypergradient: likewise.
-        estimator: likewise.
+        solver: settings of the family of this name.
+        hypergradient: settings of the family of this name.
+        estimator: settings of the family of this name.
     """
 
-    families: Annotated[Sequence[Name], MinLen(1)] = FAMILIES
+    families: Annotated[Sequence[Name], MinLen(1), Distinct()] = FAMILIES
     repeats: PositiveInt = 3
     clock: Clock = "cpu_seconds"
     docs: str | None = None
@@ -73,7 +74,19 @@ class WorkPrecision(Task):
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
-        return [stage for name in self.families if name in READS for stage in READS[name](context.graph)]
+        graph = context.graph
+        if "estimator" in self.families:
+            check_comparable(context, "work_precision.estimator")
+        if "hypergradient" in self.families and graph.learned.parts is None:
+            method = graph.learned.method.name
+            raise ValueError(
+                f"work_precision.hypergradient: want a method that follows it, got baseline={method}"
+            )
+        if "field" in self.families and graph.views[0].held_out == 0:
+            raise ValueError("work_precision.families: field wants views.held_out of at least 1, got 0")
+        stages = [stage for name in self.families if name in READS for stage in READS[name](graph)]
+        later = "hypergradient" in self.families and self.hypergradient.after_start
+        return [*stages, graph.learned] if later else stages
 
     @override
     def run(self, context: Context) -> None:
@@ -85,9 +98,9 @@ class WorkPrecision(Task):
                              "%.2g s in place of %.2g", each.name, mine.setting, other.setting, other.error,
                              mine.error, other.seconds, mine.seconds)  # fmt: skip
         held = document(found, machine())
-        if self.docs is not None:
-            write_docs(held, Path(self.docs), COMMAND)
         publish(context, found, held)
+        if self.docs is not None:  # last, since a page that cannot be written must not lose what was measured
+            write_docs(held, Path(self.docs), COMMAND)
 
     def measure(self, world: World, seed: int) -> Iterator[Series]:
         """Measure every series of every family, one after another."""
