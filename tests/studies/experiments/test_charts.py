@@ -110,7 +110,7 @@ HALF = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
 def test_bins_that_look_the_same_are_one():
     groups = {"can": {"pose": [[1, 8], [2, 7], [3, 6], [4, 5]]}}
     can, mug = histograms([setting(learned=HALF, symmetric_bins=groups)])
-    assert (can.name, can.start, can.aim, can.factor) == ("can", "4", "1", "pose")
+    assert (can.name, can.short("initial"), can.short("target"), can.factor) == ("can", "4", "1", "pose")
     assert can.p["learned"].tolist() == [[1.0, 0.0, 0.0, 0.0]]
     assert can.p["target"] == pytest.approx(np.array([[0.88, 0.04, 0.04, 0.04]]))
     assert mug.groups == [[b] for b in range(1, 9)] and mug.p["learned"].tolist() == [HALF]

@@ -158,11 +158,19 @@ def test_a_page_keeps_what_it_said_of_experiments_without_runs_here(page, tmp_pa
     smaller = {**BUDGET, "outer": {"iterations": 2}}
     with monkeypatch.context() as elsewhere:
         elsewhere.setattr(module.Settings, "read", lambda self, runs: ([], []))
+        elsewhere.setattr(module.Settings, "read", lambda self, runs: pytest.fail("runs were read before"))
         step = Experiments(rows=ROWS, paper=PAPER, draws=5, page=at, only=["large"])
         before = (tmp_path / "page.json").read_bytes()
         with pytest.raises(UserError, match=r"experiments\.page: .* another scale"):
             step.write("uri", {"budget": smaller, "seed": 0}, tmp_path)
         assert (tmp_path / "page.json").read_bytes() == before
+
+
+def test_the_page_of_another_study_is_not_overwritten(page, tmp_path):
+    (tmp_path / "numerics.json").write_text('{"field": "a table"}')
+    with pytest.raises(UserError, match=r"numerics\.json holds no results of experiments"):
+        page(page=str(tmp_path / "numerics.md"))
+    assert not (tmp_path / "numerics.md").exists()
 
 
 def test_a_page_keeps_settings_without_runs_here_beside_those_with(page, tmp_path, monkeypatch):
@@ -183,7 +191,7 @@ def test_a_page_keeps_settings_without_runs_here_beside_those_with(page, tmp_pat
 
 
 def test_our_scores_stand_beside_those_of_the_papers_table():
-    shown = LAYOUTS["objects"](MEASURED["gap"][1:], Paper(**TABLE))
+    shown, _ = LAYOUTS["objects"](MEASURED["gap"][1:], Paper(**TABLE))
     assert shown.lines[0].startswith("gap, disjoint, mAP: NSO 75.2")
     head, _, mean, can, mug = shown.text.splitlines()[2:]
     assert head == "|  | NS, ours | LTS, ours | NSO, ours | matched, ours | NS, the paper | NSO, the paper |"
@@ -192,7 +200,7 @@ def test_our_scores_stand_beside_those_of_the_papers_table():
 
 
 def test_seconds_of_an_iteration_and_of_a_field_count_stored_fields():
-    (line,) = LAYOUTS["seconds"]([setting(seeds=(0, 1))], None).lines
+    (line,) = LAYOUTS["seconds"]([setting(seeds=(0, 1))], None)[0].lines
     # Phases hypergradient_* are within hypergradient: 2 + 3. Two objects' fields took 1 s now and 5 s when stored.
     assert line == "gap, disjoint: an iteration takes 5.0 s, an object's field 3.0 s"
 
@@ -201,7 +209,7 @@ def test_seconds_that_differ_are_a_median_and_a_range():
     measured = setting(seeds=(0, 1))
     for factor, run in enumerate(measured.of_reference, start=1):
         run["seconds"]["field"] *= factor
-    (line,) = LAYOUTS["seconds"]([measured], None).lines
+    (line,) = LAYOUTS["seconds"]([measured], None)[0].lines
     assert line.endswith("an object's field 3.2 (3.0 to 3.5) s")
 
 

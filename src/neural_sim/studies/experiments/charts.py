@@ -87,7 +87,7 @@ def _order(label: str, axis: Axis) -> tuple[Any, ...]:
 
 
 def _panels(settings: Sequence[Setting], axis: Axis) -> dict[Panel, dict[str, Setting]]:
-    """Group settings by panel, then by place on the axis; of several at one place, the newest is kept.
+    """Group settings by panel, then by place on the axis, where the newest is kept if there are several.
 
     ``settings`` are sorted by experiment, the newest of each first.
     """
@@ -185,31 +185,27 @@ def levels_entries(settings: Sequence[Setting], axis: Axis) -> list[Entry]:
 
 @dataclass(frozen=True)
 class Histogram:
-    """Distributions of one factor of one object, from one start.
+    """Distributions of one factor of one object, from the reference method's runs of a setting.
 
     Args:
-        experiment: experiment of the runs.
+        setting: the setting.
         name: name of the object.
         factor: the learned factor.
-        start: short name of the initial distribution.
-        aim: short name of the target distribution.
-        seeds: seeds of the runs.
         groups: groups of bins, numbered from 1, that look the same.
         p: initial, target and learned probabilities.
         distance: mean total variation of the initial and of the learned distribution from the target's.
-        commits: code commits of the runs.
     """
 
-    experiment: str
+    setting: Setting
     name: str
     factor: str
-    start: str
-    aim: str
-    seeds: tuple[int, ...]
     groups: Sequence[Sequence[int]]
     p: Mapping[str, Float[np.ndarray, "seeds _"]]
     distance: Mapping[str, Estimate]
-    commits: Sequence[str]
+
+    def short(self, which: str) -> str:
+        """Return a short name of the ``initial`` or ``target`` distribution."""
+        return modes(self.setting.distribution(which, self.name, self.factor))
 
 
 def histograms(settings: Sequence[Setting]) -> Iterator[Histogram]:
@@ -234,11 +230,7 @@ def _histogram(setting: Setting, name: str, factor: str) -> Histogram:
         which: over_seeds(np.asarray([each[which] for each in away])).as_fraction
         for which in ("initial", "learned")
     }
-    start, aim = (modes(setting.distribution(which, name, factor)) for which in ("initial", "target"))
-    seeds = tuple(run["seed"] for run in runs)
-    return Histogram(
-        setting.experiment, name, factor, start, aim, seeds, groups, p, distance, setting.commits
-    )
+    return Histogram(setting, name, factor, groups, p, distance)
 
 
 def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
@@ -266,7 +258,9 @@ def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
         labels = ["=".join(map(str, group)) for group in each.groups]
         axes.set_xticks(x, labels)
         axes.set(ylim=(0, 1))
-        title = f"{short(each.name)}, {each.factor}: target {each.aim}, from {each.start}"
+        title = (
+            f"{short(each.name)}, {each.factor}: target {each.short('target')}, from {each.short('initial')}"
+        )
         axes.set_title(title, fontsize=8.5, color=figures.INK)
         axes.yaxis.grid(color=figures.GRID)
         axes.set_axisbelow(True)
@@ -287,10 +281,13 @@ def histogram_entries(all_of: Sequence[Histogram]) -> list[Entry]:
     made = []
     for h in all_of:
         initial, learned = (distance(h.distance[which]) for which in ("initial", "learned"))
+        experiment, start, aim = h.setting.experiment, h.short("initial"), h.short("target")
         cells = {
-            "experiment": h.experiment, "object": short(h.name), "factor": h.factor, "target": h.aim, "start": h.start,
-            "seeds": ", ".join(map(str, h.seeds)), "initial": initial, "learned": learned,
+            "experiment": experiment, "object": short(h.name), "factor": h.factor, "target": aim, "start": start,
+            "seeds": h.setting.seeds, "initial": initial, "learned": learned,
         }  # fmt: skip
-        line = f"{short(h.name)}, {h.factor} target {h.aim} from {h.start}: total variation {initial} to {learned}"
-        made.append(Entry((h.experiment, h.name, h.factor, h.aim, h.start), cells, line, h.commits))
+        line = (
+            f"{short(h.name)}, {h.factor} target {aim} from {start}: total variation {initial} to {learned}"
+        )
+        made.append(Entry((experiment, h.name, h.factor, aim, start), cells, line, h.setting.commits))
     return made

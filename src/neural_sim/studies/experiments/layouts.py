@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
@@ -18,30 +18,16 @@ from neural_sim.studies.experiments.charts import (
     levels_entries,
     levels_figure,
 )
-from neural_sim.studies.experiments.results import MEAN, Entry, Setting, called
+from neural_sim.studies.experiments.results import MEAN, Measured, Setting, called
 
+Shown = tuple[Measured, Mapping[str, Figure]]
+"""What a layout makes of some settings, without commits and costs, and figures by file name."""
+Layout = Callable[[Sequence[Setting], "Paper | None"], Shown]
 NONE = "none"
 WAYS = {NONE: "synthetic alone", "pretrain": "synthetic, then photographs", "combined": "both together"}
 """Ways of training with photographs, by ``training.real.mode``, in the order of table rows."""
 ALONE = {"real_only": "photographs alone", "views_only": "views of the fields alone"}
 """Detectors trained without synthetic images, whose rows come first in a table."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """The output of a layout for some settings.
-
-    Args:
-        lines: lines in the table of all experiments.
-        text: Markdown below that table.
-        entries: rows of a table above the text, with their own lines.
-        figures: figures by file name.
-    """
-
-    lines: Sequence[str] = ()
-    text: str = ""
-    entries: Sequence[Entry] = ()
-    figures: Mapping[str, Figure] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -78,17 +64,17 @@ class Paper:
         return f"{title}\n\n{markdown_table(['', *self.columns], rows)}"
 
 
-def _levels(axis: Axis) -> Callable[..., Shown]:
+def _levels(axis: Axis) -> Layout:
     def show(settings: Sequence[Setting], paper: Paper | None) -> Shown:
-        figure = levels_figure(settings, axis)
-        return Shown(entries=levels_entries(settings, axis), figures={"levels": figure})
+        entries = levels_entries(settings, axis)
+        return Measured(entries=entries), {"levels": levels_figure(settings, axis)}
 
     return show
 
 
 def _histograms(settings: Sequence[Setting], paper: Paper | None) -> Shown:
     found = list(histograms(settings))
-    return Shown(entries=histogram_entries(found), figures={"histograms": histogram_figure(found)})
+    return Measured(entries=histogram_entries(found)), {"histograms": histogram_figure(found)}
 
 
 def _objects(settings: Sequence[Setting], paper: Paper | None) -> Shown:
@@ -99,7 +85,7 @@ def _objects(settings: Sequence[Setting], paper: Paper | None) -> Shown:
         label, mean = setting.group.label, means[setting.first.score]
         lines.append(f"{label}, {mean}: {setting.verdict()}")
         parts.append(f"{label}, seeds {setting.seeds}:\n\n{objects_table(setting, paper, mean)}")
-    return Shown(lines, "\n\n".join(parts))
+    return Measured(lines, "\n\n".join(parts)), {}
 
 
 def objects_table(setting: Setting, paper: Paper | None, mean: str = MEAN) -> str:
@@ -118,7 +104,7 @@ def objects_table(setting: Setting, paper: Paper | None, mean: str = MEAN) -> st
 def _photographs(settings: Sequence[Setting], paper: Paper | None) -> Shown:
     """Show our scores next to the paper's Table 2: rows are ways of training, columns are numbers of photographs."""
     tables = [photographs_table(settings), *([] if paper is None else [paper.markdown()])]
-    return Shown(photographs_summary(settings), "\n\n".join(tables))
+    return Measured(photographs_summary(settings), "\n\n".join(tables)), {}
 
 
 def asked(setting: Setting) -> tuple[float, str]:
@@ -183,7 +169,7 @@ def _seconds(settings: Sequence[Setting], paper: Paper | None) -> Shown:
         lines.append(
             f"{setting.group.label}: an iteration takes {_range(iterations)} s, an object's field {_range(fields)} s"
         )
-    return Shown(lines)
+    return Measured(lines), {}
 
 
 def _iteration(record: Mapping[str, Any]) -> float:
@@ -203,7 +189,7 @@ def _range(values: Sequence[float]) -> str:
     return low if low == high else f"{middle} ({low} to {high})"
 
 
-LAYOUTS: Mapping[str, Callable[[Sequence[Setting], Paper | None], Shown]] = {
+LAYOUTS: Mapping[str, Layout] = {
     "gaps": _levels("gap"),
     "targets": _levels("target"),
     "objects": _objects,

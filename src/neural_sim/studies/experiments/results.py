@@ -218,9 +218,9 @@ class Measured:
         costs: Markdown below the text, on the costs of the methods.
     """
 
-    lines: Sequence[str]
-    text: str
-    commits: Sequence[str]
+    lines: Sequence[str] = ()
+    text: str = ""
+    commits: Sequence[str] = ()
     entries: Sequence[Entry] = ()
     costs: str = ""
 
@@ -277,12 +277,15 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
     """Read results by row name; empty if the file does not exist.
 
     Raises:
-        UserError: its results are for another ``budget`` (scale), and would be lost if the page were written.
+        UserError: its results are for another ``budget`` (scale), and would be lost if the page were written, or the
+            file has other contents.
         ValueError: the file cannot be read as JSON.
     """
     if not file.is_file():
         return {}
     document = read_json(file)
+    if not isinstance(document, Mapping) or not {"budget", "rows"} <= set(document):
+        raise UserError(f"experiments.page: {file} holds no results of experiments; want another page")
     if not at_scale(document["budget"], budget):
         had, have = flatten(document["budget"]), flatten(budget)
         changes = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -159,11 +159,11 @@ class Experiments(Task):
         settings = Settings(uri, budget, self.reference, self.draws, config["seed"])
         rows = {name: row for name, row in self._rows.items() if row.exists}
         asked = {name: row for name, row in rows.items() if self.only is None or name in self.only}
+        kept = {} if self.page is None else read_measured(document_of(self.page), budget)
         found = {name: self._found(row, settings) for name, row in asked.items()}
         for name, (_, shown, _) in found.items():
             for called, figure in shown.items():
                 figures.save(figure, folder / "figures" / f"{name}_{called}.png")
-        kept = {} if self.page is None else read_measured(document_of(self.page), budget)
         made = {name: measured.with_kept(kept.get(name), rows[name].runs)
                 for name, (measured, _, _) in found.items() if measured is not None}  # fmt: skip
         lost = list(dict.fromkeys(run for _, _, left in found.values() for run in left))
@@ -194,11 +194,10 @@ class Experiments(Task):
         if not found:
             return None, {}, left_out
         table = self._tables.get(row.table) if row.table else None
-        shown = LAYOUTS[row.layout](found, table)
+        measured, shown = LAYOUTS[row.layout](found, table)
         runs = [run for setting in found for run in setting.group.runs]
         commits = sorted({commit for setting in found for commit in setting.commits})
-        measured = Measured(list(shown.lines), shown.text, commits, shown.entries, costs_table(runs))
-        return measured, shown.figures, left_out
+        return replace(measured, commits=commits, costs=costs_table(runs)), shown, left_out
 
     def _head(self, budget: Mapping[str, Any]) -> list[str]:
         views, training, outer = budget["views"], budget["training"], budget["outer"]
