@@ -60,3 +60,7 @@ def test_words_of_a_figure_of_few_columns_are_not_cut_off():
     words = [figure._suptitle, *(axes._left_title for axes in figure.axes)]
     assert all(each.get_window_extent().x0 >= 0.0 for each in words)
     assert all(each.get_window_extent().x1 <= figure.bbox.x1 for each in words)
+    first = words[1].get_window_extent()
+    assert words[0].get_window_extent().y0 >= first.y1, (
+        "the title of a tall figure is above its first caption"
+    )

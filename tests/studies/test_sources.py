@@ -77,7 +77,7 @@ def test_the_table_and_the_files_have_every_source(context):
     assert "| **50.0** (" in text and "Differences are in bold if their interval excludes 0." in text
     one = table(replace(result, seeds=(0,)), "A heading.")
     assert "**" not in one and "bold" not in one and "intervals over test images; seed 0." in one
-    run = publish(context, result, shown, ["can", "mug"], "A heading.")
+    run = publish(context, result, shown, "A heading.")
     document = json.loads((context.folder / "study.json").read_text())
     assert document["training_images"]["other"] == 9
     assert "first seed: 4 of nerf, 4 of mesh, 9 of other." in (context.folder / "study.md").read_text()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +52,20 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def picture(axes: Any, pixels: np.ndarray, **where: Any) -> None:
+    """Show an image without ticks and frame."""
+    axes.imshow(pixels, **where)
+    axes.set(xticks=[], yticks=[])
+    for side in axes.spines.values():
+        side.set_visible(False)
+
+
 def titled(figure: Figure, text: str, fontsize: float = 11.0) -> None:
     """Write a title above a figure, in as many lines as its width asks for."""
     letters = int(72.0 * figure.get_figwidth() / (0.6 * fontsize))
-    figure.suptitle(textwrap.fill(text, max(letters, 8)), color=INK, fontsize=fontsize)
+    # Without a layout, the distance from the edge is in inches, since 2 % of a tall figure reach into its images.
+    y = None if figure.get_layout_engine() else 1.0 - 0.08 / figure.get_figheight()
+    figure.suptitle(textwrap.fill(text, max(letters, 8)), y=y, color=INK, fontsize=fontsize)
 
 
 def psi_figure(learned: Sequence[Learned], title: str) -> Figure:
@@ -239,7 +249,7 @@ def strip_figure(
         for row, name in enumerate(chosen):
             top = head + row * height
             showing = (images.labels == results.names.index(name)).any(1).nonzero()[:, 0]
-            for column, index in enumerate(showing[_spread(showing, count)].tolist()):
+            for column, index in enumerate(showing[spread(showing, count)].tolist()):
                 place = left + column * width
                 pixels = images.images[index].permute(1, 2, 0).clamp(0, 1).cpu().numpy()
                 canvas[top : top + height - 2, place : place + width - 2] = pixels[:-2, :-2]
@@ -350,15 +360,15 @@ def write_figures(
     if results.ap:
         made["ap"] = ap_figure(results.ap, names, results.biased, results.score)
     title = "Training images drawn from the learned distribution"
-    made["training_images"] = image_grid(drawn.select(_spread(drawn, 32)), names, title=title)
+    made["training_images"] = image_grid(drawn.select(spread(drawn, 32)), names, title=title)
     if detections:
-        chosen = _spread(test, 32)
+        chosen = spread(test, 32)
         found = [detections[int(i)] for i in chosen]
         title = "Detections on the test set (dashed: truth)"
         made["detections"] = image_grid(test.select(chosen), names, predictions=found, title=title)
     return [save(figure, folder / f"{name}.png") for name, figure in made.items()]
 
 
-def _spread(images: LabelledImages | torch.Tensor, count: int) -> torch.Tensor:
-    """Return indices of up to ``count`` images spread over the set."""
+def spread(images: Sized, count: int) -> torch.Tensor:
+    """Return indices of up to ``count`` images, evenly spread over all."""
     return torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()

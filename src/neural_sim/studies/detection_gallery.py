@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from neural_sim.documents import markdown_table
 from neural_sim.ranges import Fraction, PositiveInt, validated
-from neural_sim.report.figures import INK, titled
+from neural_sim.report.figures import INK, picture, spread, titled
 from neural_sim.report.tracking import Run
 from neural_sim.stages.evaluate import Scores
 from neural_sim.stages.stage import Stage
@@ -78,7 +78,7 @@ class DetectionGallery(Task):
         self, context: Context, test: LabelledImages, found: Mapping[str, Scores], class_names: Sequence[str]
     ) -> Run | None:
         """Write detection_gallery.json, detection_gallery.md and the figure, and log counts and AP to MLflow."""
-        rows = torch.linspace(0, len(test) - 1, min(self.count, len(test))).round().long()
+        rows = spread(test, self.count)
         verdicts = {
             method: judged(own.detections, test, self.draw_above, self.overlap)
             for method, own in found.items()
@@ -164,12 +164,10 @@ def detections_figure(
         for column, row in enumerate(rows.tolist()):
             axes = grid[line, column]
             pixels = test.images[row].clamp(0.0, 1.0).movedim(0, -1).cpu().numpy()
-            axes.imshow(pixels, extent=(0, width, height, 0))
+            picture(axes, pixels, extent=(0, width, height, 0))
             missed = test.boxes[row][test.present[row]][verdicts[method][row].missed]
             _draw(axes, every[row], verdicts[method][row], missed, class_names, width)
-            axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
-            for spine in axes.spines.values():
-                spine.set_visible(False)
+            axes.set(xlim=(0, width), ylim=(height, 0))
         grid[line, 0].set_ylabel(method, color=INK, fontsize=9)
     handles = [Rectangle((0, 0), 1, 1, fill=False, edgecolor=RIGHT, linewidth=1.6),
                Rectangle((0, 0), 1, 1, fill=False, edgecolor=WRONG, linewidth=1.6),

@@ -20,7 +20,7 @@ from neural_sim.documents import markdown_table
 from neural_sim.field.base import RadianceField
 from neural_sim.ranges import Distinct, PositiveInt, validated
 from neural_sim.renderer.nerf_w import NerfWRenderer
-from neural_sim.report.figures import MUTED, titled
+from neural_sim.report.figures import MUTED, picture, titled
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Task
@@ -151,13 +151,11 @@ def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> 
     axes = figure.add_axes(
         (named / across, 0.35 / down, 1.4 * count / across - 0.01, 1.4 * len(views) / down)
     )
-    axes.imshow(canvas)
+    picture(axes, canvas)
     axes.set_yticks([(row + 0.5) * height for row in range(len(views))], list(views))
     fractions = [f"{i / (count - 1):.2g}" for i in range(count)]
     axes.set_xticks([(column + 0.5) * width for column in range(count)], fractions)
     axes.tick_params(length=0, colors=MUTED, labelsize=8)
-    for side in axes.spines.values():
-        side.set_visible(False)
     change = max(row.opacity_change for row in views.values())
     titled(figure, f"{title} (opacity changes by at most {change:.0e})", 10)
     return figure

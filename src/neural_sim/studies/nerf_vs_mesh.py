@@ -89,13 +89,13 @@ class NerfVsMesh(Task):
         sources, names = self.sources(graphs[0]), list(context.graph.names)
         write_training_set(sources["nerf"].images(results), names, context.folder / "training_set")
         heading = f"Detectors trained on images of fields (nerf) and of meshes ({found.sources[1]})."
-        publish(context, found, Samples.of(results, sources, self.shown), names, heading)
+        publish(context, found, Samples.of(results, sources, self.shown), heading)
 
     def tests(self, graph: Graph) -> dict[str, TargetSetsStage]:
         """Return the test sets by name."""
         synthesis = graph.experiment.imaging.synthesis
         return {
-            name: replace(graph.targets, synthesizer=replace(synthesis, objects_per_image=count))
+            name: replace(graph.targets, synthesizer=replace(synthesis, objects_per_image=tuple(count)))
             for name, count in (("single", self.single), ("multiple", self.multiple))
         }
 

@@ -14,7 +14,7 @@ from typing_extensions import override
 from neural_sim.documents import markdown_table
 from neural_sim.parameter.distributions import total_variation
 from neural_sim.ranges import PositiveInt, validated
-from neural_sim.report.figures import INK, titled
+from neural_sim.report.figures import INK, spread, titled
 from neural_sim.report.tracking import Run
 from neural_sim.stages.graph import Graph, Psi
 from neural_sim.stages.stage import Results, Stage
@@ -97,8 +97,7 @@ class SamplesGallery(Task):
     def _shown(self, test: LabelledImages, label: int) -> LabelledImages:
         """Choose test images that show an object, evenly spaced."""
         rows = (test.labels == label).any(-1).nonzero().squeeze(-1)
-        chosen = torch.linspace(0, len(rows) - 1, min(self.count, len(rows))).round().long()
-        return test.select(rows[chosen])
+        return test.select(rows[spread(rows, self.count)])
 
 
 def _distance(graph: Graph, psi: Psi, label: int) -> dict[str, float] | None:
@@ -157,6 +156,7 @@ def samples_figure(samples: Samples, columns: int) -> Figure:
     for (name, (images, caption)), height in zip(panels.items(), heights, strict=True):
         axes = figure.add_axes((0.01, (top - height) / total, 0.98, (height - 0.4) / total))
         axes.imshow(_canvas(images, columns))
+        axes.set_anchor("W")  # with its caption, if the figure is wider than the images
         axes.set_axis_off()
         axes.set_title(name + caption, loc="left", color=INK, fontsize=9)
         top -= height

@@ -21,12 +21,12 @@ from neural_sim.field.scores import compare, where_known
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.views import choose_mesh_renderer
-from neural_sim.report.figures import INK, titled
+from neural_sim.report.figures import INK, picture, titled
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.reconstruction import ReconstructionStage, ReconstructionSubjectStage
 from neural_sim.stages.stage import Results, Stage
-from neural_sim.studies.sources import More, Samples, compare_sources, graphs_of_seeds, publish
+from neural_sim.studies.sources import Samples, compare_sources, graphs_of_seeds, publish
 from neural_sim.synthesis.subjects import PhotographedField, RenderedSubject
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PosedViews
@@ -92,7 +92,7 @@ class SfmVsNerf(Task):
     @override
     def run(self, context: Context) -> None:
         graphs, results = graphs_of_seeds(context, self.seeds), context.results
-        names, meshes = list(context.graph.names), self._reconstructions(graphs[0])
+        meshes = self._reconstructions(graphs[0])
         objects = [self._held_out(graphs[0], results, i, results(mesh)) for i, mesh in enumerate(meshes)]
 
         def sources(graph: Graph) -> dict[str, DetectorStage]:
@@ -101,12 +101,8 @@ class SfmVsNerf(Task):
         found = compare_sources(graphs, results, sources, lambda graph: {"test": graph.targets}, self.draws)
         samples = Samples.of(results, sources(graphs[0]), self.shown)
         heading = "Detectors trained on images of fields (nerf) and of meshes reconstructed from the same views (sfm)."
-        more = More(
-            {"held_out": {each.object: dict(each.scores) for each in objects}},
-            held_out_table(objects),
-            {"held_out": held_out_figure(objects)},
-        )
-        publish(context, found, samples, names, heading, more)
+        more = {"held_out": {each.object: dict(each.scores) for each in objects}}
+        publish(context, found, samples, heading, more, held_out_table(objects), held_out_figure(objects))
 
     def _held_out(self, graph: Graph, results: Results, label: int, mesh: RenderedSubject) -> HeldOut:
         """Render an object's held-out views with its field and with its reconstruction, and score the renders."""
@@ -147,10 +143,7 @@ def held_out_figure(objects: Sequence[HeldOut]) -> Figure:
     for column, each in enumerate(objects):
         for line, name in enumerate(rows):
             axes = grid[line, column]
-            axes.imshow(each.images[name].clamp(0.0, 1.0).cpu().numpy())
-            axes.set(xticks=[], yticks=[])
-            for spine in axes.spines.values():
-                spine.set_visible(False)
+            picture(axes, each.images[name].clamp(0.0, 1.0).cpu().numpy())
             if name in each.scores:
                 axes.set_xlabel(f"{each.scores[name]['psnr']:.1f} dB", color=INK, fontsize=8)
         grid[0, column].set_title(each.object, color=INK, fontsize=9)

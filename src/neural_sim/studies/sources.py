@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
 from neural_sim.documents import markdown_table
@@ -125,32 +124,20 @@ class Samples:
         for name, stage in sources.items():
             images = stage.images(results).images.to("cpu")
             counts[name] = len(images)
-            parts.append(_spaced(images, most))
+            parts.append(images.select(figures.spread(images, most)))
         fewest = min(len(part) for part in parts)
-        return Samples(counts, LabelledImages.concatenate([_spaced(part, fewest) for part in parts]))
-
-
-def _spaced(images: LabelledImages, most: int) -> LabelledImages:
-    rows = torch.linspace(0, len(images) - 1, min(most, len(images))).round().long()
-    return images.select(rows)
-
-
-@dataclass(frozen=True)
-class More:
-    """What a study adds to the document, the text and the figures."""
-
-    document: Mapping[str, object] = dataclasses.field(default_factory=dict)
-    text: str = ""
-    figures: Mapping[str, Figure] = dataclasses.field(default_factory=dict)
+        equal = [part.select(figures.spread(part, fewest)) for part in parts]
+        return Samples(counts, LabelledImages.concatenate(equal))
 
 
 def publish(
     context: Context,
     found: SideBySide,
     samples: Samples,
-    classes: Sequence[str],
     heading: str,
-    more: More | None = None,
+    more: Mapping[str, object] | None = None,
+    text: str = "",
+    figure: Figure | None = None,
 ) -> Run | None:
     """Write the table, the document and the figures, and log the AP of every source to MLflow.
 
@@ -158,16 +145,17 @@ def publish(
         context: context of the study.
         found: the scores.
         samples: training images of every source.
-        classes: names of the classes.
         heading: sentence that introduces the sources.
-        more: further tables and figures.
+        more: further entries of the document.
+        text: text below the tables.
+        figure: a figure of held-out views.
     """
-    more = more or More()
+    classes = list(next(iter(found.per_class.values()))[found.sources[0]])
     rows = "; ".join(f"row {i + 1}: {source}" for i, source in enumerate(found.sources))
     columns = len(samples.shown) // len(found.sources)
     grid = figures.image_grid(samples.shown, classes, columns, title=f"Training images, {rows}")
     numbers = ", ".join(f"{count} of {source}" for source, count in samples.counts.items())
-    parts = [table(found, f"{heading} Training images with the first seed: {numbers}."), more.text]
+    parts = [table(found, f"{heading} Training images with the first seed: {numbers}."), text]
     metrics = {
         f"{kind}/{source}/ap": estimate.value
         for kind, row in found.ap.items()
@@ -175,9 +163,9 @@ def publish(
     }
     return context.publish(
         context.config["name"],
-        {**dataclasses.asdict(found), "training_images": samples.counts, **more.document},
+        {**dataclasses.asdict(found), "training_images": samples.counts, **(more or {})},
         "\n\n".join(part for part in parts if part),
-        {"ap": ap_figure(found, heading), **more.figures, "training_images": grid},
+        {"ap": ap_figure(found, heading), "training_images": grid} | ({"held_out": figure} if figure else {}),
         metrics,
     )
 
