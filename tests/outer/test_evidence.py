@@ -5,6 +5,7 @@ import torch
 from scipy import stats
 
 from neural_sim.outer.evidence import Average
+from neural_sim.parameter.bins import closing
 
 DOUBLE = torch.float64
 
@@ -35,6 +36,9 @@ def test_a_derivative_that_is_not_finite_counts_for_nothing():
     torch.testing.assert_close(average.variance, ones * torch.tensor([[1.0], [0.5]], dtype=DOUBLE))
     none = Average.zeros(good)
     assert float(none.value.abs().max()) == 0.0 and none.p_values.tolist() == [1.0, 1.0]
+    unknown = none.joined(good, torch.full_like(good, torch.inf))
+    for empty in (none, unknown):
+        assert bool((empty.variance == torch.inf).all()) and empty.p_values.tolist() == [1.0, 1.0]
 
 
 def test_p_values_are_those_of_the_chi_square_and_uniform_under_noise():
@@ -111,3 +115,31 @@ def test_objects_with_small_derivatives_are_held_to_their_own_scatter():
     # Noise has the variance 4, of which images explain 1.
     small, large = average.between[::2].mean(), average.between[1::2].mean()
     assert float(large) == pytest.approx(3.0, rel=0.15) and float(small) == pytest.approx(3e-4, rel=0.15)
+
+
+def test_closed_bins_change_nothing():
+    """The mean, its variance and its test are those of the same derivatives without the closed bins."""
+    generator = torch.Generator().manual_seed(0)
+    closed = torch.tensor([False, True, True, False, False, True, False, True]).expand(50, 8)
+    every = Average.zeros(closing(torch.zeros(50, 8, dtype=DOUBLE), closed))
+    reduced = Average.zeros(torch.zeros(50, 4, dtype=DOUBLE))
+    for _ in range(3):
+        direction, variance = centred(normal(generator, 50, 4)), normal(generator, 50, 4).square()
+        reduced = reduced.joined(direction, variance)
+        wide = [torch.zeros(50, 8, dtype=DOUBLE).masked_scatter(~closed, v) for v in (direction, variance)]
+        every = every.joined(*wide)
+    torch.testing.assert_close(every.between, reduced.between)
+    torch.testing.assert_close(every.p_values, reduced.p_values)
+    assert float(reduced.between.max()) > 0.0
+    for name in ("value", "variance"):
+        torch.testing.assert_close(getattr(every, name)[~closed].view(50, 4), getattr(reduced, name))
+
+
+def test_an_object_with_a_single_open_bin_has_no_evidence():
+    closed = torch.tensor([[True, False, True]])
+    average = Average.zeros(closing(torch.zeros(1, 3, dtype=DOUBLE), closed))
+    for variance in (0.0, 0.1):
+        average = average.joined(
+            torch.zeros(1, 3, dtype=DOUBLE), torch.full((1, 3), variance).double() * ~closed
+        )
+        assert average.p_values.tolist() == [1.0] and average.between.tolist() == [0.0]

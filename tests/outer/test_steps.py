@@ -10,8 +10,9 @@ import torch
 from neural_sim.gradient.hypergradient import Hypergradient, UnrolledAdjoint
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.outer.certificate import Trust, certify
-from neural_sim.outer.steps import FreeSteps, LearnedObjects
+from neural_sim.outer.steps import FreeSteps, LearnedObjects, slopes_by_p
 from neural_sim.outer.trust_region import TrustRegion
+from neural_sim.parameter.bins import closing
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import SGD
@@ -107,6 +108,19 @@ def test_directions_are_derivatives_by_p_where_a_bin_is_at_the_floor():
     steps, _ = steps.observe(hypergradient(-by_logits, torch.zeros_like(by_logits)))
     direction = steps.observed["pose"].value
     torch.testing.assert_close(direction, scores - scores.mean(1, keepdim=True))
+
+
+def test_closed_bins_have_no_part_in_the_direction():
+    """Scores of the open bins alone count; the direction is centred over them."""
+    closed = torch.tensor([[False, True, False, False], [False] * 4])
+    psi = closing(torch.tensor([[0.5, 0.0, -0.5, 0.2], [0.0] * 4], dtype=torch.float64), closed)
+    scores = torch.tensor([[0.1, 9.0, 0.4, 0.7], [0.2, 0.3, 0.1, 0.5]], dtype=torch.float64)
+    leaf = psi.clone().requires_grad_()
+    (by_logits,) = torch.autograd.grad((POSE.p_of(leaf) * scores).sum(), leaf)
+    direction, variance = slopes_by_p(POSE, psi, -by_logits, torch.where(closed, 0.0, 0.1).double())
+    mean = scores.where(~closed, 0.0).sum(1, keepdim=True) / (~closed).sum(1, keepdim=True)
+    torch.testing.assert_close(direction, (scores - mean).where(~closed, 0.0))
+    assert torch.equal(variance > 0.0, ~closed)
 
 
 def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorter():

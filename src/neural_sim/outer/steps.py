@@ -221,12 +221,13 @@ def slopes_by_p(
 
     The derivative with respect to logits is (p - floor) times the one by p (up to a constant), so that steps along it
     would hardly move a bin of small p. ``error`` has the standard errors of ``gradient``; the second result has the
-    variances of the first.
+    variances of the first. Both are 0 in closed bins, which have no derivative with respect to p.
     """
-    # log_slopes are -inf in closed bins, where the gradient is 0.
-    scale = factor.log_slopes(psi).exp().clamp_min(torch.finfo(psi.dtype).tiny)
-    direction = -gradient / scale
-    return direction - direction.mean(-1, keepdim=True), (error / scale).square()
+    scale = factor.log_slopes(psi).exp()
+    open_ = scale > 0.0
+    direction = torch.where(open_, -gradient / scale, 0.0)
+    centre = direction.sum(-1, keepdim=True) / open_.sum(-1, keepdim=True)
+    return torch.where(open_, direction - centre, 0.0), torch.where(open_, (error / scale).square(), 0.0)
 
 
 def stacked(
