@@ -15,7 +15,8 @@ from neural_sim.gradient.pathwise import (
     map_cotangents,
     psi_contributions,
 )
-from neural_sim.gradient.significance import DRAWS
+from neural_sim.gradient.significance import DRAWS, zero_mean
+from neural_sim.parameter.bins import closing
 from neural_sim.synthesis.motion import moved_by
 from neural_sim.types import Maps
 
@@ -142,6 +143,26 @@ def test_the_p_value_is_that_of_contributions_without_what_all_components_share(
         assert abs(found - exact) < 4 * (exact * (1.0 - exact) / DRAWS) ** 0.5 + 1 / DRAWS
         p_values.append(exact)
     assert min(p_values) < 0.05
+
+
+@pytest.mark.parametrize("bin", range(4))
+def test_a_closed_bin_changes_no_p_value(problem, pathwise, generator, bin):
+    """Its derivatives are 0, and must not come in as rounding errors of the others' mean."""
+    opened = torch.arange(4) != bin
+    problem.psi = closing(problem.psi, ~opened)
+    batch, params = problem.object_images(), problem.minimiser(problem.psi)
+    vector = {
+        name: torch.randn(value.shape, generator=generator, dtype=DOUBLE) for name, value in params.items()
+    }
+
+    def scores(psi):
+        images = problem.images(psi)
+        return torch.func.jvp(lambda p: problem.loss_of(p, images, batch.index), (params,), (vector,))[1]
+
+    rows = torch.autograd.functional.jacobian(scores, problem.psi)
+    assert not rows[:, bin].any() and bool(rows[:, opened].any())
+    expected = zero_mean(rows[:, opened] - rows[:, opened].mean(1, keepdim=True))
+    assert pathwise(problem.loss_of, params, vector, batch).p_values["pose"] == expected
 
 
 def test_images_without_a_path_are_refused(problem, pathwise):

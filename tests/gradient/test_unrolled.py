@@ -16,7 +16,9 @@ from neural_sim.gradient.base import ObjectImages, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator, reinforce, stratified
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reversal import Examples, RecordedTraining, reversed_steps
+from neural_sim.gradient.significance import no_difference
 from neural_sim.gradient.unrolled import Accumulated, ProbeGroups, Unrolled, step_weights
+from neural_sim.parameter.bins import closing
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.solver.operator import flatten, unflatten
@@ -196,6 +198,19 @@ def test_stratified_is_the_derivative_over_hard_bins_of_the_training_that_was_ru
     ]
     expected = torch.tensor(expected, dtype=DOUBLE)
     assert float((ours - expected).norm()) < 1e-6 * float(expected.norm())
+
+
+def test_closed_bins_have_no_part_in_the_test_of_stratified_scores():
+    """Renders of bins that no photograph shows have scores far from the others', which moves nothing."""
+    closed = torch.tensor([False, True, False, False])
+    images = dataclasses.replace(images_of(torch.full((8,), 1 / 8, dtype=DOUBLE)), psi=closing(PSI, closed))
+    scored = torch.randn(4, 12, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
+    scored = scored + 100.0 * closed[:, None]
+    probes = {"pose": Probes(torch.arange(48), torch.arange(4).repeat_interleave(12))}
+    sums = Accumulated(torch.zeros(0), (), scored.flatten(), 48)
+    found = StratifiedEstimator(12).accumulated(sums, images, probes)
+    assert found.p_values["pose"] == no_difference(scored[~closed].T) > 0.05
+    assert found.value[1] == 0.0 != found.value[0]
 
 
 def test_the_score_function_takes_the_derivative_by_the_images_weights(micro):

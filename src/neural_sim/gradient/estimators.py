@@ -22,6 +22,7 @@ from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.reversal import Wanted
 from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.unrolled import Accumulated
+from neural_sim.parameter.bins import is_closed
 from neural_sim.parameter.factor import BinnedFactor, Factor
 from neural_sim.parameter.product import Draws, HardDraws
 from neural_sim.ranges import PositiveInt, validated
@@ -107,8 +108,8 @@ class StratifiedEstimator:
     ) -> MixedDerivative:
         """See ``Estimator``.
 
-        The p-values test the null hypothesis that a factor's bins, or lights, have equal mean scores, so that the
-        derivative is zero.
+        The p-values test the null hypothesis that a factor's open bins, or its lights, have equal mean scores, so that
+        the derivative is zero.
         """
         scored = losses.probes
         if scored is None:
@@ -140,7 +141,8 @@ class StratifiedEstimator:
             strata = probes[factor.name]
             along = scored(strata.index).to(images.psi)
             parts[factor.name] = by_strata(along, factor, psi[factor.name], weight)
-            p_values[factor.name] = no_difference(along.view(factor.size, -1).T)
+            counted = ~is_closed(psi[factor.name])  # scores of closed bins have no effect on the derivative
+            p_values[factor.name] = no_difference(along.view(factor.size, -1)[counted].T)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
