@@ -15,6 +15,7 @@ from neural_sim.outer.inner import InnerLoop, LoopInputs, Numbers
 from neural_sim.outer.objective import Loss
 from neural_sim.outer.preflight import PhotographGain, equivalent, gains_of, photograph_gains
 from neural_sim.outer.trust_region import TrustRegion
+from neural_sim.parameter.bins import closing
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 
@@ -82,6 +83,28 @@ def test_a_step_gains_no_more_than_what_bins_may_lose(distribution, psi):
     assert first.step == pytest.approx(most, rel=1e-3)
 
 
+def test_no_gain_is_told_of_a_bin_to_which_nothing_can_move(distribution, psi):
+    """The closed bin has the lowest cost of all; the gains of the others are those without it."""
+    psi = closing(psi, torch.tensor([[False, True, False, False], [False] * 4]))
+    first, second = gains(distribution, psi, 0.0)
+    assert first.by_bin[1] is first.by_bin_error[1] is None and None not in second.by_bin
+    p = psi.softmax(-1)[0]
+    for bin in (0, 2, 3):
+        after = 0.8 * p + 0.2 * torch.eye(4, dtype=torch.float64)[bin]
+        assert first.by_bin[bin] == pytest.approx(float((p - after) @ COST[0]), abs=1e-12)
+
+
+@pytest.mark.parametrize("trainings", [2, 3])
+def test_every_trial_has_probes_of_its_own_as_far_as_they_are_renewed(loop, trainings):
+    """Half of the probes are renewed before each derivative after the first, by turns, whether or not psi moves."""
+    drawn = []
+    for _ in range(1 + trainings):
+        loop.derivative()
+        drawn.append(loop._probes.cached.features[0].flatten(1))
+    same = [(drawn[0] == later).all(1).view(-1, 2).tolist() for later in drawn[1:]]
+    assert same[0] == [[False, True]] * 8 and same[1] == [[False, False]] * 8
+
+
 def test_errors_fall_with_the_root_of_the_trials(distribution, psi):
     (one, _), (four, _) = gains(distribution, psi, 0.01), gains(distribution, psi, 0.01, trials=4)
     assert four.by_bin_error == pytest.approx([0.5 * e for e in one.by_bin_error], rel=1e-9)
@@ -144,8 +167,12 @@ def test_numbers_in_between_are_interpolated():
     assert equivalent(gains, 0.1) == pytest.approx(10.0)
     assert equivalent(gains, 0.25) == pytest.approx(17.5)
     assert equivalent(gains, 0.5) is None
+    assert equivalent(gains, 0.0) == equivalent(gains, -0.1) == 0.0
     harmful = [PhotographGain(10, -0.1, None), PhotographGain(25, 0.1, None)]
     assert equivalent(harmful, 0.05) == pytest.approx(10.0 + 15.0 * 0.75)
+    assert equivalent(harmful, -0.05) == 0.0
+    useless = [PhotographGain(10, 0.0, None)]
+    assert equivalent(useless, 0.0) == 0.0 and equivalent(useless, 0.05) is None
 
 
 def test_bad_numbers_are_refused(loop, photographs):

@@ -75,7 +75,7 @@ class SimulatorModule(GradientLoop):
         implicit = adjoint if isinstance(adjoint, Implicit) else Implicit()
         subset, own = curvature_rows(drawn, weights, implicit.curvature_images, self.numbers.generator)
         if isinstance(adjoint, Unrolled):
-            # Photographs do not count here: each step takes their fraction from its batch, see Examples.drawn.
+            # Photographs do not count here: each step's batch has its own fraction of them, see Examples.drawn_part.
             images = self._images(trained, torch.full((drawn,), 1.0 / drawn))
             return self._with_fixed(self._through_training(trained, objective, images, adjoint))
         device = self.inner.device
@@ -163,7 +163,7 @@ class SimulatorModule(GradientLoop):
             return
         new = max(1, round(self.settings.refresh * per_bin))
         fresh = self._every_bin(new)
-        self._probes = fresh if new == per_bin else self._probes.renewed(fresh, len(self.records))
+        self._probes = fresh if new == per_bin else self._probes.renewed(fresh)
 
     def _every_bin(self, per_bin: int) -> ProbeSet:
         """Draw ``per_bin`` images of every bin of every factor of the learned objects, with their features."""

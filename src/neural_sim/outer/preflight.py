@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neural_sim.detector.cached_set import CachedSet
@@ -31,8 +31,9 @@ class ExpectedGains:
         factor: the factor of psi.
         p_value: p-value of the null hypothesis that the derivative is zero.
         moved: fraction of the object's images that moves to a bin.
-        by_bin: fall of L_val if they move to each bin (or light) from all bins, in proportion to their p.
-        by_bin_error: standard errors of ``by_bin``.
+        by_bin: fall of L_val if they move to each bin (or light) from all bins, in proportion to their p; None for
+            closed bins, to which no image can move.
+        by_bin_error: standard errors of ``by_bin``; None for closed bins.
         step: fall of L_val from a step of the loop along the derivative.
         step_error: standard error of ``step``.
     """
@@ -41,8 +42,8 @@ class ExpectedGains:
     factor: str
     p_value: float
     moved: float
-    by_bin: tuple[float, ...]
-    by_bin_error: tuple[float, ...]
+    by_bin: tuple[float | None, ...]
+    by_bin_error: tuple[float | None, ...]
     step: float
     step_error: float
 
@@ -95,19 +96,26 @@ def gains_of(
         step = factor.p_of(step_within(factor, own, average.value, radius, region.keep)) - p
         gains, spread = _along(toward, average.value[:, None], variance[:, None])
         step_gain, step_spread = _along(step, average.value, variance)
+        p_values = average.p_values
         for i, name in enumerate(names):
+            by_bin, by_bin_error = (_opened(values[i], average.open[i]) for values in (gains, spread))
             found.append(
                 ExpectedGains(
-                    name, factor.name, float(average.p_values[i]), moved, tuple(gains[i].tolist()),
-                    tuple(spread[i].tolist()), float(step_gain[i]), float(step_spread[i]),
+                    name, factor.name, float(p_values[i]), moved, by_bin, by_bin_error, float(step_gain[i]),
+                    float(step_spread[i]),
                 )
             )  # fmt: skip
     return found
 
 
 def _along(change: Tensor, direction: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first-order gain of a change of p, and its standard error for independent component errors."""
+    """Return the first-order gain of a change of p, and its standard error if components err independently."""
     return (change * direction).sum(-1), (change.square() * variance).sum(-1).sqrt()
+
+
+def _opened(values: Float[Tensor, "k"], open_: Bool[Tensor, "k"]) -> tuple[float | None, ...]:
+    """Return the values of open bins, and None for closed ones."""
+    return tuple(float(value) if counts else None for value, counts in zip(values, open_, strict=True))
 
 
 @dataclass(frozen=True)
@@ -164,7 +172,12 @@ def _gain(count: int, without: Sequence[float], with_them: Sequence[float]) -> P
 
 
 def equivalent(gains: Sequence[PhotographGain], fall: float) -> float | None:
-    """Interpolate the number of photographs at which L_val falls this far; None: more than were tried are needed."""
+    """Interpolate the number of photographs at which L_val falls this far.
+
+    It is 0 if it need not fall, and None if more photographs are needed than were tried.
+    """
+    if fall <= 0.0:
+        return 0.0
     before = PhotographGain(0, 0.0, None)
     for gain in sorted(gains, key=lambda g: g.photographs):
         if gain.fall >= fall:

@@ -28,11 +28,13 @@ class ProbeSet:
         probes: for each object, by factor, its rows of ``cached``, bin after bin; empty for objects left out.
         cached: the images' features.
         per_bin: number of images in every bin.
+        turn: number of times that some were replaced.
     """
 
     probes: list[dict[str, Probes]]
     cached: CachedSet
     per_bin: int
+    turn: int = 0
 
     @staticmethod
     def draw(
@@ -67,6 +69,7 @@ class ProbeSet:
             "features": [level.cpu() for level in cached.features],
             "targets": [cached.targets.labels.cpu(), cached.targets.deltas.cpu()],
             "per_bin": self.per_bin,
+            "turn": self.turn,
         }
 
     @staticmethod
@@ -75,17 +78,17 @@ class ProbeSet:
         features = tuple(level.to(device) for level in state["features"])
         targets = Targets(*(part.to(device) for part in state["targets"]))
         probes = [{name: Probes(*rows) for name, rows in own.items()} for own in state["rows"]]
-        return ProbeSet(probes, CachedSet(detector, features, targets), state["per_bin"])
+        return ProbeSet(probes, CachedSet(detector, features, targets), state["per_bin"], state["turn"])
 
-    def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
-        """Replace ``fresh.per_bin`` probes of every bin, those whose turn it is in the iteration ``turn``.
+    def renewed(self, fresh: ProbeSet) -> ProbeSet:
+        """Replace ``fresh.per_bin`` probes of every bin, the ones that have been there longest.
 
         Raises:
             ValueError: there are more fresh probes of a bin than it has.
         """
         if fresh.per_bin > self.per_bin:
             raise ValueError(f"probes: want at most {self.per_bin} fresh ones per bin, got {fresh.per_bin}")
-        places = (turn * fresh.per_bin + torch.arange(fresh.per_bin)) % self.per_bin
+        places = (self.turn * fresh.per_bin + torch.arange(fresh.per_bin)) % self.per_bin
         targets, sources, probes = [], [], []
         for old, new in zip(self.probes, fresh.probes, strict=True):
             probes.append({})
@@ -97,4 +100,4 @@ class ProbeSet:
                 targets.append(rows.reshape(-1))
                 sources.append(new[name].index)
         cached = self.cached.replaced(torch.cat(targets), fresh.cached.select(torch.cat(sources)))
-        return ProbeSet(probes, cached, self.per_bin)
+        return ProbeSet(probes, cached, self.per_bin, self.turn + 1)

@@ -119,6 +119,17 @@ def test_lights_are_not_said_to_be_read_right(tmp_path):
     assert "0 % of the variance of guesses on held-out renders explained" in page and "read right" not in page
 
 
+def test_bins_that_no_photograph_shows_have_no_gain(tmp_path):
+    first = ExpectedGains("can", "pose", 0.01, 0.15, (None, -0.2, 0.1), (None, 0.01, 0.02), 0.1, 0.02)
+    report = dataclasses.replace(preflight(0.5), foreseen=(first,))
+    assert "3 (+0.1000 ± 0.0200 for 15% of its images)" in report.summary()
+    images = LabelledImages(
+        torch.rand(2, 3, 24, 24), torch.zeros(2, 1, 4), torch.full((2, 1), -1), torch.zeros(2).long()
+    )
+    page = write_preflight_page(report, images, images, tmp_path, {}).read_text()
+    assert page.count("no photograph</span>") == 1 and "None" not in page
+
+
 def test_what_the_target_shows_is_said_and_drawn(tmp_path):
     shown = (
         FactorEstimate(

@@ -137,8 +137,12 @@ class Preflight:
             f"{'object':<14}{'factor':<14}{'p':>9}{'step':>9}{'error':>9}  best bin",
         ]
         for f in self.foreseen:
-            best = max(range(len(f.by_bin)), key=lambda b: f.by_bin[b])
-            gain = f"{best + 1} ({f.by_bin[best]:+.4f} ± {f.by_bin_error[best]:.4f} for {f.moved:.0%} of its images)"
+            best, error, bin = max(
+                (gain, error, number)
+                for number, (gain, error) in enumerate(zip(f.by_bin, f.by_bin_error, strict=True), 1)
+                if gain is not None and error is not None
+            )
+            gain = f"{bin} ({best:+.4f} ± {error:.4f} for {f.moved:.0%} of its images)"
             lines.append(
                 f"{f.name[:13]:<14}{f.factor[:13]:<14}{f.p_value:>9.2g}{f.step:>9.4f}{f.step_error:>9.4f}  {gain}"
             )
@@ -185,7 +189,8 @@ def write_preflight_page(
             ("Synthesised images", synthesised),
         )
     }
-    largest = max((abs(gain) for f in report.foreseen for gain in f.by_bin), default=0.0) or 1.0
+    known = [abs(gain) for f in report.foreseen for gain in f.by_bin if gain is not None]
+    largest = max(known, default=0.0) or 1.0
     thumbnails = {
         (name, factor): [picture(image) for image in images]
         for name, own in bins.items()
