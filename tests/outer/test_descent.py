@@ -160,8 +160,13 @@ def test_objects_that_validation_does_not_show_keep_their_psi(scene, caplog):
     learned = learn_psi(module)
     assert not learned.last[0].any() and set(learned.records[1].verdicts) == {"b"}
     assert all(set(record.certificate.actions) == {"b"} for record in learned.records[:2])
-    both = checked_loop(scene, shown=slice(3, 6), learned=("a", "b"))
-    assert set(learn_psi(both).records[1].verdicts) == {"a", "b"}
+    caplog.clear()
+    asked = checked_loop(scene, shown=slice(3, 6), learned=("a", "b"))
+    assert asked.objects.names == ["b"] and "so their psi stays as it is: a" in caplog.text
+    free = small_loop(
+        scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2, shown=slice(3, 6), learned=("a", "b")
+    )
+    assert free.objects.names == ["a", "b"]
 
 
 def test_validation_without_an_object_is_refused(scene):

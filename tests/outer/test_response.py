@@ -16,6 +16,8 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import Response, ResponseLoop, agreement, centred_cosine, response
 from neural_sim.outer.steps import LearnedObjects
 from neural_sim.parameter.bins import closing
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 
 PSI = torch.tensor([[0.5, 0.0, -0.5, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 
@@ -106,6 +108,23 @@ def test_agreement_includes_objects_with_closed_bins(loop):
     for sign in (1.0, -1.0):
         told = SimpleNamespace(gradients=dict(zip(inner.scene.names, sign * slopes, strict=True)))
         assert agreement(slopes, psi, told, first) == pytest.approx(sign)
+
+
+@pytest.mark.parametrize("bins", [1, 2, 3, 4, 6])
+def test_objects_move_to_every_bin_and_consecutive_ones_to_different_bins(scene, monkeypatch, bins):
+    distribution, psi = SceneDistribution.of([Pose(bins=bins)]), torch.zeros(2, bins, dtype=torch.float64)
+    scene = dataclasses.replace(scene, distribution=distribution)
+    estimator, moved = StratifiedEstimator(probes_per_bin=2), []
+    loop = small_loop(scene, estimator, psi=psi, pool_per_bin=2, **CHECKED)
+    inner = linear(loop.inner, torch.zeros(2, bins, dtype=torch.float64))
+    train = Linear.train
+    monkeypatch.setattr(
+        Linear, "train", lambda self, at, *more: (moved.append(at), train(self, at, *more))[1]
+    )
+    response(inner, psi, loop.numbers)
+    places = torch.stack([distribution.probabilities(at)["pose"].argmax(1) for at in moved[1:]])
+    assert all(sorted(own) == list(range(bins)) for own in places.T.tolist())
+    assert bins == 1 or bool((places[:, 0] != places[:, 1]).all())
 
 
 def test_its_loop_climbs_to_the_best_bins(scene):

@@ -273,7 +273,8 @@ def test_trainings_scatter_in_every_class_adds_to_the_error_of_the_sum(fall, kep
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     steps = replace(steps_at(torch.zeros(2, 4, dtype=torch.float64)), at_rest=(0.01,))
     steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    _, verdicts = steps.judge(scored(0.0, 0.0, 0.0), scored(0.5, 0.5, -1.0 - fall))
+    # A class without a box has no score, and adds no error either.
+    _, verdicts = steps.judge(scored(0.0, 0.0, 0.0, math.nan), scored(0.5, 0.5, -1.0 - fall, math.nan))
     assert [verdict.accepted for verdict in verdicts.values()] == [kept, kept]
 
 

@@ -39,7 +39,7 @@ class Derived:
 
 
 class GradientLoop(OuterLoop, ABC):
-    """The loop of methods with a derivative, which a subclass computes in ``_derivative``.
+    """The loop of methods that follow a derivative; a subclass computes it in ``_derivative``.
 
     One Lightning training step is one outer iteration.
 
@@ -129,9 +129,9 @@ class GradientLoop(OuterLoop, ABC):
     def _settle(self, verdicts: Mapping[str, Verdict]) -> None:
         """Hold still the objects that have an estimate from the first step; if these are all objects, the loop ends.
 
-        A rejected estimate does not count. The objects held do not return to an earlier psi at the end either: a pair
-        of trainings has already judged them, and an estimate from the target's boxes is better evidence than scores
-        that scatter between trainings.
+        A rejected estimate does not count. The objects held do not return to an earlier psi at the end either: if the
+        estimate moved them, a pair of trainings has already judged that, and the target's boxes are better evidence
+        than scores that scatter between trainings.
         """
         steps, rejected = self.steps, {name for name, verdict in verdicts.items() if not verdict.accepted}
         settled = read_objects(self.shown) - rejected
@@ -294,19 +294,20 @@ def learned_objects(inner: InnerLoop) -> LearnedObjects:
     """Choose the objects whose psi moves: those requested, otherwise all that validation images show.
 
     An object that none of them shows affects L_val only where it is mistaken for another, which says nothing about its
-    best psi.
+    best psi. A trust region leaves it out even if it is requested: it has no score by which a step could be accepted.
 
     Raises:
         ValueError: no validation image shows an object.
     """
     names, wanted = inner.scene.names, inner.settings.learned
-    if wanted is not None:
-        labels = [label for label, name in enumerate(names) if name in wanted]
-    elif not inner.shown:
-        raise ValueError("the target's validation images show none of the objects, so psi cannot be learned")
-    else:
-        labels = sorted(inner.shown)
-        unseen = [name for label, name in enumerate(names) if label not in inner.shown]
+    labels = [label for label, name in enumerate(names) if wanted is None or name in wanted]
+    if wanted is None or isinstance(inner.settings.steps, TrustRegion):
+        unseen = [names[label] for label in labels if label not in inner.shown]
+        labels = [label for label in labels if label in inner.shown]
+        if not labels:
+            raise ValueError(
+                "the target's validation images show none of the objects, so psi cannot be learned"
+            )
         if unseen:
             _log.warning(
                 "no validation image shows these objects, so their psi stays as it is: %s", ", ".join(unseen)

@@ -29,7 +29,8 @@ from neural_sim.parameter.factor import Factor
 PART = 0.15
 """Fraction of an object's images that move to the bin."""
 SPACING = 3
-"""Distance between the bins of consecutive objects in one run, so that objects move to different bins."""
+"""Distance between the bins of consecutive objects in one run, so that they move to different bins; 1 for a factor of
+three bins."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def response(
     for factor in distribution.factors:
         value = psi.new_zeros(len(psi), factor.size)
         for run in range(factor.size):
-            bins = (run + SPACING * objects) % factor.size
+            bins = (run + (SPACING % factor.size or 1) * objects) % factor.size
             trained = inner.train(_moved(inner, psi, factor, bins, part), common, theta)
             gain = trained.scores.sum(1) - before
             value[objects, bins] = gain[: len(psi)].to(value) / part
@@ -153,7 +154,7 @@ class ResponseLoop(GradientLoop):
         gradients = {
             name: slopes[i] if i in self.objects.labels else zero for i, name in enumerate(self.scene.names)
         }
-        # The errors are unknown and taken as 0, so that only the training at the new psi decides on each step.
+        # The errors are unknown. As 0, they leave the scatter between trainings as the only noise of the derivatives.
         return Hypergradient(gradients, dict.fromkeys(gradients, zero), None)
 
 

@@ -48,7 +48,7 @@ class Outer:
         refresh: fraction of the probes that an iteration replaces. The others keep their images, whose other factors
             follow the psi at which they were drawn.
         learned: names of the objects whose psi a hypergradient moves; None: all that validation images show. The others
-            get no probes and no second derivatives.
+            get no probes and no second derivatives. A trust region leaves out those that no validation image shows.
         certify_every: number of iterations between comparisons of the hypergradient with the finite-difference response
             of training at the same psi (``outer.response``, one training for each bin); 0: never.
         first_step: where the loop goes first: along the first derivative, or to an estimate from the target's boxes;

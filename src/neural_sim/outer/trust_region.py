@@ -212,7 +212,8 @@ class TrustRegionSteps:
         gains, images = change.sum(1), _errors_of_sums(change)
         # Computed before at_rest is extended: harm that this step does to other objects is not scatter of trainings.
         total_error = (
-            _errors_of_sums(change.nansum(0)).square() + len(gains) * _between_trainings(self.at_rest)
+            _errors_of_sums(change.nansum(0)).square()
+            + gains.isfinite().sum() * _between_trainings(self.at_rest)
         ).sqrt()
         excess = (gains.square() - images.square())[labels][~pending]
         excess = excess[excess.isfinite()]
