@@ -84,10 +84,11 @@ class RenderedPath:
 class ObjectImages:
     """One object's training images at one psi.
 
-    ``psi`` is the object's psi, all factors of ``distribution`` (p_psi) joined. ``index`` holds the images' rows in the
-    training set, ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N without photographs). ``draw`` holds
-    the scene parameters with which they were rendered. For the unrolled adjoint, the weights leave photographs out,
-    because each step's batch has its own fraction of them. Only the pathwise estimator needs ``images`` and ``path``.
+    ``psi`` is the object's psi, one vector for all factors of ``distribution`` (p_psi). ``index`` holds the images'
+    rows in the training set, ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N without photographs).
+    ``draw`` holds the scene parameters with which they were rendered. For the unrolled adjoint, the weights leave
+    photographs out, because each step's batch has its own fraction of them. Only the pathwise estimator needs
+    ``images`` and ``path``.
     """
 
     psi: Float[Tensor, "K"]

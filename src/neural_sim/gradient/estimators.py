@@ -300,7 +300,7 @@ def reinforce(
     maps psi to the draws' log-probabilities.
 
     Raises:
-        ValueError: fewer than 2 draws, or another number of log-probabilities than of draws.
+        ValueError: there are fewer than 2 draws, or not as many log-probabilities as draws.
     """
     count = scores.numel()
     if scores.ndim != 1 or count < 2:

@@ -133,10 +133,11 @@ class Unrolled:
         probes_per_step: number of probes of every bin that a step scores, in shuffled passes over all of them; 0: all.
             At 1, most of a derivative's variance comes from the choice of probes and of validation images
             (docs/numerics.md, Noise of a derivative).
-        scored_steps: approximate number of steps that score probes; 0: all. A longer training is divided into blocks.
-            In each block one random step scores probes, with the block's weight, see ``step_weights``. More objects
-            mean more probes and more steps: if every step scored probes, the cost would grow with the square of the
-            number of objects.
+        scored_steps: number of steps up to which all of them score probes; 0: all steps do in any training. A longer
+            training is divided into blocks. In each block one random step scores probes, with the block's weight, see
+            ``step_weights``. The number of blocks grows slowly: it is 1.6 times ``scored_steps`` at 5 times the steps,
+            and 2.2 times at 20 times. More objects mean more probes and more steps: if every step scored probes, the
+            cost would grow with the square of the number of objects.
         chunk_size: number of probes whose losses are computed at a time.
         floor: smallest denominator allowed for an entry of theta in AdamW's steps, as a fraction of what is usual for
             the entry and its tensor, see ``detector.trajectory.AdamW.floored``; 0 is exact.

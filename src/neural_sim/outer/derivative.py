@@ -1,4 +1,4 @@
-"""Inputs of a derivative, from the loop: losses by row, the path from psi to an image, and a recorded training."""
+"""What a derivative is computed from: losses by row, the path from psi to an image, and a recorded training."""
 
 from __future__ import annotations
 

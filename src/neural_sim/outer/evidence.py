@@ -59,10 +59,11 @@ class Average:
     def between(self) -> Float[Tensor, "objects"]:
         """Variance of a component between trainings; 0 if no object has two derivatives at one psi.
 
-        It is estimated from the scatter of an object's derivatives at one psi, less their variance over images. A
-        prior counts as one more pair of derivatives for each object. It is the median, over objects, of the ratio of
-        the variance between trainings to that over images: a ratio because derivatives of different objects differ in
-        size, a median so that one object with wildly scattered derivatives does not hide the signal of the others.
+        It is estimated from the scatter of an object's derivatives at one psi, less their variance over images, and
+        from a prior that counts as one more pair of derivatives. The prior is the object's variance over images, times
+        the median over objects of the ratio of the variance between trainings to that over images: a ratio because
+        derivatives of different objects differ in size, a median so that one object with wildly scattered derivatives
+        does not hide the signal of the others.
         """
         excess, freedom = self._excess
         if not bool((freedom > 0).any()):

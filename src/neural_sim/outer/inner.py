@@ -160,8 +160,8 @@ class InnerLoop:
 
     The backbone is the one in ``params``, frozen except for its last ``settings.loop_layers`` stages. These stages, the
     pyramid and the head are trained for ``settings.epochs`` epochs at a time, or more if ``settings.least_steps``
-    requires it. Images of relaxed draws, or with a light that is learned, are rendered for every training; all others
-    come from a pool of renders of every bin (``settings.pool_per_bin``).
+    requires it. Images come from a pool of renders of every bin, or are rendered for every training if draws are
+    relaxed, a light is learned, or ``settings.pool_per_bin`` is 0.
 
     Attributes:
         scene: the scene from which images are drawn.
@@ -253,7 +253,10 @@ class InnerLoop:
         return drawn if self.photographs is None else CachedSet.concatenate([drawn, self.photographs])
 
     def weights(self, examples: CachedSet) -> Float[Tensor, "N"]:
-        """Return the examples' weights in the training loss, on the CPU: 1 / N each, unless photographs are added."""
+        """Return the examples' weights in the training loss, on the CPU.
+
+        They are 1 / N each, unless photographs have a fixed fraction of every batch.
+        """
         sampling = self._sampling(examples)
         return torch.full((len(examples),), 1.0 / len(examples)) if sampling is None else sampling.weights
 

@@ -37,8 +37,9 @@ class Objective:
     score: SmoothAP | SmoothAccuracy | Loss
 
     def folds(self, count: int, generator: torch.Generator) -> list[Objective]:
-        """Split L_val by dividing the validation images at random into ``count`` parts, or fewer if images are fewer.
+        """Split L_val by dividing the validation images at random into ``count`` parts, of at least one image each.
 
+        If there are fewer images than that, there are as many parts as images.
         The parts have the same number of images of every class (the class of an image's first box), give or take one.
         """
         shuffled = torch.randperm(len(self.images), generator=generator)
