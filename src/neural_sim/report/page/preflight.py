@@ -137,12 +137,13 @@ class Preflight:
             f"{'object':<14}{'factor':<14}{'p':>9}{'step':>9}{'error':>9}  best bin",
         ]
         for f in self.foreseen:
-            best, error, bin = max(
+            gains = [
                 (gain, error, number)
                 for number, (gain, error) in enumerate(zip(f.by_bin, f.by_bin_error, strict=True), 1)
                 if gain is not None and error is not None
-            )
-            gain = f"{bin} ({best:+.4f} ± {error:.4f} for {f.moved:.0%} of its images)"
+            ]
+            best, error, number = max(gains, key=lambda one: one[0])
+            gain = f"{number} ({best:+.4f} ± {error:.4f} for {f.moved:.0%} of its images)"
             lines.append(
                 f"{f.name[:13]:<14}{f.factor[:13]:<14}{f.p_value:>9.2g}{f.step:>9.4f}{f.step_error:>9.4f}  {gain}"
             )
