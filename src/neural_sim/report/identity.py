@@ -22,6 +22,8 @@ RUN_KEYS = (
     "preflight", "repeat", "predict", "export", "box", "viewer", "doctor",
 )  # fmt: skip
 """Keys that may differ between runs of the same settings: how a run is executed, and what else is made of it."""
+STUDY = "work_precision."
+"""Prefix of the budget's keys that only a study reads, and no run."""
 SHOWN = 3
 """Number of differences that are named; the others are counted."""
 
@@ -57,14 +59,20 @@ def identity(
 
 
 def at_scale(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Check that all budget keys of a run match the present ones; keys added later are ignored.
+    """Check that all budget keys of a run match the present ones, see ``scale_of``; keys added later are ignored.
 
     Args:
-        then: the run's budget; values are compared as text, as MLflow stores them.
+        then: the run's budget.
         now: the present budget.
     """
-    had, have = ({key: str(value) for key, value in flatten(budget).items()} for budget in (then, now))
+    had, have = scale_of(then), scale_of(now)
     return bool(had) and had.items() <= have.items()
+
+
+def scale_of(budget: Mapping[str, Any]) -> dict[str, str]:
+    """Return the keys of a budget that runs depend on, with values as text, as MLflow stores them."""
+    values = {key: str(value) for key, value in flatten(budget).items()}
+    return {key: value for key, value in values.items() if not key.removeprefix("budget.").startswith(STUDY)}
 
 
 def scored_config(config: Mapping[str, Any]) -> dict[str, Any]:

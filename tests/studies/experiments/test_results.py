@@ -1,10 +1,13 @@
 """Which runs are the settings of an experiment; rows are kept at one scale; documents come from the newest run."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from composing import composed
 from finished_runs import BUDGET, finished, results
+from omegaconf import OmegaConf
 
 from neural_sim.configuration import UserError
 from neural_sim.report import tracking
@@ -147,6 +150,12 @@ ROWS = {
 }
 
 
+def test_the_page_of_the_documentation_is_at_todays_scale():
+    """Otherwise no further experiment could be added to it."""
+    budget = OmegaConf.to_container(composed("scale=quick").budget)
+    assert read_measured(Path(__file__).parents[3] / "docs" / "experiments.json", budget)
+
+
 def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
     file = document_of(str(tmp_path / "page.md"))
     assert file.name == "page.json" and read_measured(file, SCALE) == {}
@@ -159,6 +168,8 @@ def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
         UserError, match=r"\(budget\.\S+ was .+ and is gone\); want that scale, or another page"
     ):
         read_measured(file, {"views": SCALE["views"]})
+    write_measured(file, {**SCALE, "work_precision": {"gone": 64}}, ROWS)  # a key that no run reads
+    assert read_measured(file, SCALE) == ROWS
     write_measured(file, {}, ROWS)
     with pytest.raises(UserError, match="another scale \\(it names none\\)"):
         read_measured(file, SCALE)

@@ -18,11 +18,11 @@ from neural_sim.configuration import UserError
 from neural_sim.digests import digest
 from neural_sim.documents import markdown_table, read_json, write_json
 from neural_sim.report import tracking
-from neural_sim.report.identity import at_scale, scored_values
+from neural_sim.report.identity import at_scale, scale_of, scored_values
 from neural_sim.report.intervals import Estimate, points
 from neural_sim.report.runs import BOUNDS, WITHOUT, FinishedRun, Group, LeftOut, Runs, score_table, select
 from neural_sim.report.score_table import ScoreTable
-from neural_sim.report.tracking import UNKNOWN, flatten
+from neural_sim.report.tracking import UNKNOWN
 
 AXES = re.compile(r"parameter\.\w+\.(gap|biased)\b|training\.real\.(mode|count|fraction)$")
 """Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects, and the
@@ -287,11 +287,11 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
     if not isinstance(document, Mapping) or not {"budget", "rows"} <= set(document):
         raise UserError(f"experiments.page: {file} holds no results of experiments; want another page")
     if not at_scale(document["budget"], budget):
-        had, have = flatten(document["budget"]), flatten(budget)
+        had, have = scale_of(document["budget"]), scale_of(budget)
         changes = [
             f"budget.{key} was {had[key]} and {f'is {have[key]} now' if key in have else 'is gone'}"
             for key in had
-            if str(had[key]) != str(have.get(key))
+            if had[key] != have.get(key)
         ]
         raise UserError(
             f"experiments.page: the results in {file} are for another scale ({(changes or ['it names none'])[0]}); "
