@@ -205,6 +205,9 @@ def test_a_ply_that_ends_early_or_names_no_vertex_is_refused(tmp_path):
     path = ply(tmp_path / "m.ply", [*XYZ, *FACES], [*QUAD, "3 0 1 2"])
     with pytest.raises(ValueError, match=r"m\.ply: .*cut off: want 2 rows of face"):
         load_file(path, "m", "")
+    ply(path, [*XYZ, *FACES], [*QUAD, "3 0 1 2", "-3 0 1 3"])
+    with pytest.raises(ValueError, match="a list of face has length -3"):
+        load_file(path, "m", "")
     ply(path, [*XYZ, *FACES], [*QUAD, "3 0 1 2", "3 0 1 4"])
     with pytest.raises(ValueError, match=r"refers to vertex 4 or 0, but there are 4"):
         load_file(path, "m", "")

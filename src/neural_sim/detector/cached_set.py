@@ -67,7 +67,7 @@ class CachedSet:
     ) -> CachedSet:
         """Compute what ``of`` returns for all ``sets`` concatenated, in the same batches.
 
-        Only one set and an incomplete batch are in memory at a time.
+        Only the images of one set and of an incomplete batch are in memory at a time.
 
         Raises:
             ValueError: there is no set.

@@ -50,7 +50,7 @@ def assign_anchors(
     """Match anchors to boxes like torchvision's ``Matcher`` with low-quality matches, but all images at once.
 
     Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding. An anchor takes the box it overlaps
-    most if that overlap reaches ``foreground_iou``, or if the anchor is the best one of any box (not necessarily of
+    most if that overlap reaches ``foreground_iou``, or if the anchor is the best one for any box (not necessarily for
     that one); otherwise it is ignored if its overlap is between the thresholds.
 
     Raises:
@@ -66,7 +66,7 @@ def assign_anchors(
         overlap = torch.where(present[..., None], overlap, -1.0)
         best, match = overlap.max(dim=1)
         most = overlap.amax(dim=2, keepdim=True)
-        # Without the second condition, a box that no anchor touches would be claimed by every anchor, at overlap 0.
+        # Without the second condition, a box that no anchor touches, or padding, would make every anchor foreground.
         rescued = ((overlap == most) & (most > 0)).any(dim=1)
         foreground = (best >= foreground_iou) | rescued
         ignored = (best >= background_iou) & ~foreground
@@ -92,8 +92,8 @@ def assign_points(
 
     A point takes the smallest box around it whose centre is less than ``radius`` strides away along both axes, and
     whose farthest side is at a distance in the point's range, more than its low and at most its high end, in pixels.
-    (torchvision excludes both ends, so that a distance between two ranges belongs to neither level. Boxes of rendered
-    masks have whole pixels, and such distances.)
+    (torchvision excludes both ends, so a distance equal to a limit belongs to neither level. That happens to boxes of
+    rendered masks, whose corners are whole pixels.)
 
     Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding.
 

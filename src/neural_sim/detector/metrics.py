@@ -119,7 +119,7 @@ def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> 
     """Explain in one line why a score is meaningless and what to do; None if it is meaningful."""
     known = [value for value in score.per_class.values() if value == value]
     if not known:
-        return "no class has a box in these images, so that nothing is scored: want labels of these classes"
+        return "no class has a box in these images, so nothing is scored: want labels of the objects' classes"
     if any(known):
         return None
     if isinstance(score, Accuracy):
@@ -131,7 +131,7 @@ def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> 
     why = f"none of its {count} boxes lies on an object of its class" if count else "it detects nothing"
     return (
         f"it is 0 for every class: {why}; want more training.cold_epochs, or training images whose objects are as "
-        "large as in these"
+        "large as those in these images"
     )
 
 
@@ -173,7 +173,7 @@ def _average_precision(
     values = [float("nan")] * classes
     present = {int(label) for image in truth for label in image["labels"]}
     for label, value in zip(result["classes"].reshape(-1), result["map_per_class"].reshape(-1), strict=True):
-        # COCO's -1 stands for "no ground truth"; a class that is only predicted counts as absent, too.
+        # COCO's -1 stands for "no ground truth"; a class that is only predicted counts as absent as well.
         if int(label) in present:
             values[int(label)] = float(value)
     return values

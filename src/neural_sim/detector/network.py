@@ -214,7 +214,7 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
             state = torch.load(weights, map_location="cpu", weights_only=True)
         except OSError as error:
             raise ValueError(f"detector.backbone.weights: {weights} cannot be read ({error})") from error
-        except Exception as error:  # on a broken file, torch's reader fails wherever the bytes lead it
+        except Exception as error:  # torch's reader may raise anything on a broken file
             raise ValueError(f"detector.backbone.weights: {weights} is not a torch.save file") from error
         if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
             raise ValueError(f"detector.backbone.weights: {weights} holds no state dictionary")
@@ -247,7 +247,8 @@ def build_backbone(
     """Build a backbone by name.
 
     Raises:
-        ValueError: the architecture has no pretrained weights, or see ``load_weights``.
+        ValueError: the architecture has no published weights but ``weights`` is not None, or ``load_weights`` refuses
+            them.
     """
     if architecture in PLANS:
         if weights is not None:
@@ -273,7 +274,7 @@ class NormalisedBackbone(nn.Module):
 
 
 def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
-    """Return one number for each channel, on the device of ``like``, to which nothing is copied."""
+    """Return one number for each channel, made on the device of ``like`` without a copy from the host."""
     return torch.cat([like.new_full((1, 1, 1), value) for value in values])
 
 
@@ -350,7 +351,7 @@ def initialise(
 ) -> dict[str, Tensor]:
     """Draw a state dictionary of ``module``, with normalisations of scale 1 and biases of 0, except for one.
 
-    Convolutions without a bias, which an activation follows, are He-normal. Those with a bias start at standard
+    Convolutions without a bias, which a normalisation follows, are He-normal. Those with a bias start at standard
     deviation 0.01 in a predictor's ``head`` (Lin et al. 2017, Sec. 4.1); elsewhere they preserve the variance of their
     input, as torchvision's do. The bias of the layer ``cls_logits`` makes it predict ``prior_probability``. Linear
     layers start at standard deviation 0.01 (Goyal et al. 2017).

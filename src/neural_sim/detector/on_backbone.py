@@ -37,7 +37,7 @@ ImageSize = PositiveInt | tuple[PositiveInt, PositiveInt]
 
 @validated
 class BackboneDetector(Detector):
-    """A detector whose images pass through a backbone. A subclass sets ``_predictor``, the network on its features.
+    """A detector whose images pass through a backbone. A subclass sets ``_predictor``, which takes the features.
 
     ``normalisation`` has the mean and the standard deviation of each channel (red, green, blue), by which the backbone
     first normalises images in [0, 1].
@@ -82,12 +82,12 @@ class BackboneDetector(Detector):
     def in_loop(self, layers: int | None) -> BackboneDetector:
         """Return the detector as the psi loop trains it, with the last ``layers`` stages of its backbone.
 
-        By default (None), one stage of the small backbones, and no stage of a ResNet, whose stages have millions of
-        parameters.
+        By default (None), it trains one stage of the small backbones, and none of a ResNet, whose last stages have
+        millions of parameters.
 
         Raises:
-            ValueError: the backbone has published weights, whose normalisation is frozen; or ``layers`` is negative or
-                not below the backbone's number of stages.
+            ValueError: the backbone has pretrained weights, so its normalisation is frozen; or ``layers`` is negative
+                or not below the backbone's number of stages.
         """
         if layers is None:
             layers = int(self._settings.architecture in PLANS)
@@ -134,7 +134,7 @@ class BackboneDetector(Detector):
         return [name for name in params if name in names]
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """Separate the backbone's parameters, without those that the psi loop trains, from all others."""
+        """Separate the backbone's parameters from all others, which include any stages that the psi loop trains."""
         last = set() if self._last is None else {name for name, _ in self._last.named_parameters()}
         backbone = {n: value for n, value in params.items() if n.startswith("backbone.") and n not in last}
         return backbone, {name: value for name, value in params.items() if name not in backbone}
@@ -211,8 +211,8 @@ class PyramidDetector(BackboneDetector):
         rising = len(own) > 0 and own == tuple(sorted(set(own)))
         if not rising or strides[len(own) :] != _coarser(own, strides, available):
             raise ValueError(
-                f"{where}.strides: want an ascending choice of {available} for {backbone.architecture}, and from its "
-                f"last on coarser ones, each twice the one before, got {strides}"
+                f"{where}.strides: want an ascending choice of {available} for {backbone.architecture}; after its "
+                f"last, coarser ones may follow, each twice the one before; got {strides}"
             )
         super().__init__(num_classes, image_size, backbone, own, activation, proximal, head.prior)
         self.detections = detections

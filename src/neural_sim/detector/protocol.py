@@ -20,7 +20,7 @@ Parameters = dict[str, Tensor]
 Score = Literal["AP", "accuracy"]
 """The score of predictions: COCO's average precision, or the top-1 accuracy of each image's best class."""
 SUPPRESSED = 1000
-"""Number of boxes of several images that go through non-maximum suppression together."""
+"""Largest number of boxes from several images that go through non-maximum suppression together."""
 Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors code"]]
 
 

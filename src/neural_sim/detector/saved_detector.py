@@ -257,9 +257,8 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
         ValueError: an argument is not a number, string, sequence, mapping or dataclass of these.
     """
     kind, given = make, {}
-    while isinstance(
-        kind, functools.partial
-    ):  # functools.partial does not flatten Hydra's own partial, which is a subclass
+    # functools.partial does not flatten Hydra's own partial, which is a subclass.
+    while isinstance(kind, functools.partial):
         kind, given = kind.func, {**kind.keywords, **given}
     defaults = {
         name: parameter.default

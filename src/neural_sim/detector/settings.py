@@ -115,7 +115,7 @@ class Points:
         limits: for all levels but the last, the largest distance from a point to the farthest side of its box, in
             pixels of an image whose shorter side is ``reference``; larger distances belong to the next level.
         reference: that side in pixels; None: limits are in pixels of any image.
-        radius: a point detects a box only if it is less than this many strides from its centre, along each axis.
+        radius: a point detects a box only if the box's centre is less than this many strides away, along each axis.
     """
 
     strides: Sequence[PositiveInt] = (8, 16)

@@ -49,8 +49,8 @@ class SmoothAP:
         temperature: width of the ranks' sigmoid, in logits; AP is the limit at 0.
         width: width of the true positives' sigmoid, in intersection over union; AP is the limit at 0.
         per_class: number of best detections of each class in an image that count.
-        loss: weight of the training loss that is added, because a class without true positives has an AP without
-            gradient, but a loss with one.
+        loss: weight of the training loss that is added, because the AP of a class without true positives has no
+            gradient, but the loss has one.
     """
 
     temperature: Positive = 0.2
@@ -79,7 +79,7 @@ class SmoothAP:
         """Compute each detection's contribution to one class's AP, the mean over ``THRESHOLDS``.
 
         Raises:
-            ValueError: the class has no boxes, so that its AP is undefined.
+            ValueError: the class has no boxes, so its AP is undefined.
         """
         if detections.boxes == 0:
             raise ValueError("smooth_ap: want at least one box of the class")
@@ -128,7 +128,7 @@ def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_cla
 def nearest_box(
     boxes: Float[Tensor, "m 4"], truth: Float[Tensor, "m boxes 4"], present: Bool[Tensor, "m boxes"]
 ) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"]]:
-    """Find each detection's largest intersection over union with a ``present`` box, and that box; 0, -1 if none is."""
+    """Find each detection's largest intersection over union with a ``present`` box, and that box; else 0 and -1."""
     if truth.shape[1] == 0:
         return boxes.new_zeros(len(boxes)), torch.full_like(boxes[:, 0], -1, dtype=torch.long)
     # Below every overlap, so that a detection that touches no box is not matched to a row without one.

@@ -38,7 +38,7 @@ class Optimisation:
     Args:
         epochs, batch_size: these set the number of steps.
         learning_rate: peak of the schedule; 0 leaves the parameters unchanged.
-        weight_decay: decoupled weight decay of convolution weights (not of biases and normalisations).
+        weight_decay: decoupled weight decay of convolutional and linear weights (not of biases and normalisations).
         warmup_fraction: fraction of the steps over which the learning rate rises.
     """
 
@@ -136,7 +136,7 @@ class DetectorModule(pl.LightningModule):
         gradients = [value.grad for value in self._values if value.grad is not None]
         if len(gradients) < len(self._names):
             missed = [n for n, value in zip(self._names, self._values, strict=True) if value.grad is None]
-            raise ValueError(f"DetectorModule: no gradient, and so no step to record, of {missed}")
+            raise ValueError(f"DetectorModule: {missed} have no gradient, so the step cannot be recorded")
 
         def moment(name: str) -> Tensor:
             # The optimiser has no moments before its first step.

@@ -67,7 +67,7 @@ class Album:
 
 
 def pictures_of(folder: Path) -> list[Path]:
-    """Return a capture's photographs: those in its subfolder ``images`` or, without one, in its folder itself."""
+    """Return a capture's photographs: those in its subfolder ``images`` or, if it has none, in the folder itself."""
     if (folder / FOLDER).is_dir():
         return picture_files(folder / FOLDER)
     own = sorted(

@@ -50,7 +50,7 @@ class BOP(MeshFiles):
         self._info = folder / "models_info.json"
 
     def load(self) -> list[ObjectMesh]:
-        """Load the objects, normalised, in the order of ``names``; their transforms give metres.
+        """Load the objects, normalised, in the order of ``names``; their transforms lead back to metres.
 
         Raises:
             ValueError: a file cannot be read, or the diameter of a mesh is not that in models_info.json, whether the

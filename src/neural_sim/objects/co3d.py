@@ -37,13 +37,13 @@ class Co3d(Photos):
     Args:
         root: the folder that holds the categories' folders.
         names: categories; null: all.
-        sequences: category -> name of its sequence. For other categories, or with null, it is the sequence with the
-            highest ``viewpoint_quality_score``, or the longest if none has a score.
+        sequences: category -> name of its sequence. Categories that are not listed use the sequence with the highest
+            ``viewpoint_quality_score``, or the longest if none has a score.
         masks, up, size, box, scene, refinement, poor, mask_command, mask_value: see ``Photos``.
 
     Raises:
         ValueError: a folder is missing or has no categories, a name or sequence is unknown, or annotations cannot be
-            read or lack a key (the message has the file and the key); see ``Photos`` for the others.
+            read or lack a key (the message names the file and the key); see ``Photos`` for other reasons.
     """
 
     def __init__(

@@ -50,7 +50,7 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
     the file's own frame, in metres.
 
     Raises:
-        ValueError: the file cannot be read or has no triangles; the message has the reason.
+        ValueError: the file cannot be read or has no triangles; the message says why.
     """
     with _named(path, f"object {name!r} cannot be read as a mesh"):
         mesh = _READERS[path.suffix.lower()](path)
@@ -162,7 +162,7 @@ class MeshFiles:
         wanted: what the folder should hold, for messages.
 
     Raises:
-        ValueError: there are no files, or whatever ``choose`` raises.
+        ValueError: there are no files, or ``choose`` refuses the names.
     """
 
     metric: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""Any folder of meshes: files in one folder, or one sub-folder for each object."""
+"""Any folder of meshes: files in one folder, or one subfolder for each object."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from neural_sim.ranges import validated
 
 log = logging.getLogger(__name__)
 
-# In order of preference, if a sub-folder holds one object in several formats.
+# In order of preference, if a subfolder holds one object in several formats.
 FORMATS = (".glb", ".obj", ".ply", ".stl", ".gltf")
 OTHER_FORMATS = (".fbx", ".dae", ".off", ".3ds", ".3mf", ".blend", ".usd", ".usdz", ".usdc", ".stp", ".drc")
-"""Formats of meshes that are not read."""
+"""Mesh formats that cannot be read."""
 
 
 @validated
 class MeshFolder(MeshFiles):
     """Meshes in a folder (.glb, .obj, .ply, .stl, .gltf), with +z up (+y in glTF), in metres.
 
-    The unit matters only where distances are in metres. A file is one object, named after its stem. A sub-folder is one
-    object with the folder's name: its only mesh, or the first by ``FORMATS``; nested folders are searched.
+    The unit matters only where distances are in metres. A file is one object, named after its stem. A subfolder is one
+    object with the folder's name: the only mesh in it or in the folders below, or the first by ``FORMATS``.
 
     Raises:
         ValueError: the folder does not exist or has no mesh, a name is unknown, or two objects have the same name.

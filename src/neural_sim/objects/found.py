@@ -34,9 +34,9 @@ NAMED = 12
 ONE_SIDED = 0.2
 """Length of the cameras' mean horizontal direction above which they are on one side; it is 0 if they are all around."""
 LEVEL = 0.1
-"""Smallest spread of the cameras' horizontal axes in a second direction (root mean square) that tells what is up."""
+"""Smallest spread of the cameras' horizontal axes in a second direction (root mean square) from which up is found."""
 SIDEWAYS = 0.5
-"""A photograph lies on its side if another of its axes fits the others' up better by this margin (of cosines)."""
+"""A photograph lies on its side if another of its axes is nearer to the others' up direction by this much (cosine)."""
 
 _OVERLAP = "let each photograph show two thirds of what the one before shows, and add texture, such as a printed sheet"
 

@@ -36,7 +36,9 @@ class Accessors:
         data, start = self._buffers[view["buffer"]], view.get("byteOffset", 0)
         end = start + view["byteLength"]
         if not 0 <= start <= end <= len(data):
-            raise ValueError(f"bufferViews[{index}] wants bytes {start} to {end}, its buffer has {len(data)}")
+            raise ValueError(
+                f"bufferViews[{index}] wants bytes {start} to {end}, but its buffer has {len(data)}"
+            )
         return data[start:end]
 
     def stored(self, index: int) -> bool:
@@ -92,7 +94,7 @@ class Accessors:
         stride = self._views[view].get("byteStride", size)
         end = start + (count - 1) * stride + size if count else start
         if start < 0 or stride < size or end > len(data):
-            raise ValueError(f"bufferViews[{view}] has {len(data)} bytes, an accessor wants {end}")
+            raise ValueError(f"bufferViews[{view}] has {len(data)} bytes, but an accessor wants {end}")
         return np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)).copy()
 
     def _sparse(self, values: np.ndarray, sparse: Mapping[str, Any], index: int) -> np.ndarray:

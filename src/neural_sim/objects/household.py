@@ -74,7 +74,7 @@ def pitcher(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def tall_box(generator: torch.Generator) -> trimesh.Trimesh:
-    """Make a red carton: front print on +x, and on -x the back print, which the flat box has, too."""
+    """Make a red carton: front print on +x, and on -x the back print, which the flat box also has."""
     panels = _box_prints(generator)
     panels["+x"] = _red_front(BOX_EMBLEM, BOX_BAND, generator)
     panels["-x"] = _red_back(generator)

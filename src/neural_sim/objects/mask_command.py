@@ -46,7 +46,7 @@ class MaskCommand:
             raise ValueError(f"{KEY}: no such program: {program}")
 
     def masks(self, images: Sequence[Path], value: int | None = None) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Return the program's mask of each photograph; if masks are label images, the object has ``value``.
+        """Return the program's mask of each photograph; in label images, the object's pixels have ``value``.
 
         Raises:
             ValueError: the program cannot be run or fails, a photograph has no mask, or a mask cannot be read.

@@ -56,12 +56,12 @@ class MeshSource(Source, Protocol):
 
 
 def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None = None) -> ObjectMesh:
-    """Copy ``mesh`` (in metres) with its bounding box centred and scaled to the unit sphere.
+    """Copy ``mesh`` (in metres), centre its bounding box on the origin, and scale it to fit the unit sphere.
 
     ``source`` (a file or another origin) is used in messages. Without ``digest`` the mesh is hashed.
 
     Raises:
-        ValueError: the extent is zero or not finite.
+        ValueError: the mesh has no vertices, or its extent is zero or not finite.
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if len(vertices) == 0 or not np.isfinite(vertices).all():
@@ -73,7 +73,8 @@ def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None 
     if radius < DEGENERATE_EXTENT:
         raise ValueError(f"{source}: want a mesh with extent, got one of radius {radius:g}")
     scaled = mesh.copy()
-    normals = np.array(mesh.vertex_normals)  # shift and scale keep normals, but trimesh would drop the file's
+    # Shifting and scaling keep normals, but trimesh would drop the file's.
+    normals = np.array(mesh.vertex_normals)
     scaled.vertices = (vertices - centre) / radius
     scaled.vertex_normals = normals
     transform = np.eye(4)

@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 ALL_PAIRS = 40
 """Largest number of photographs for which ``matching="auto"`` compares every pair."""
 SKELETON = 5
-"""With ``matching="auto"``, all pairs of every fifth photograph are compared, because a walk may end at its start."""
+"""With ``matching="auto"``, all pairs among every fifth photograph are compared: a walk may end at its start."""
 LARGE = 800
 """Longer side in pixels from which features are searched for only at the photographs' own size."""
 BATCH = 8
@@ -57,10 +57,10 @@ class Colmap:
             order of their names; ``auto``: all of up to 40 photographs; of more, nearby ones and all pairs among every
             fifth photograph.
         overlap: number of following photographs with which each is compared, if not all pairs are; those 1, 2, 4, 8,
-            ... places further on are added.
+            ... places after it are added.
         region: which part of a photograph is searched. ``all``: all of it; ``object``: only what the masks show;
-            ``auto``: all of it, unless the room stands still while the object turns: then what the masks show or,
-            without masks, what does not stand still.
+            ``auto``: all of it; if the room stands still while the object turns, only what the masks show or, without
+            masks, only what moves.
     """
 
     picture_size: Annotated[int, Ge(200)] = 1000
@@ -78,7 +78,7 @@ class Colmap:
             progress: whether to show a bar.
 
         Raises:
-            ValueError: the cameras cannot be found; the message has the reason and what to do.
+            ValueError: the cameras cannot be found; the message says why, and what to do.
         """
         if len(album.shots) < LEAST:
             raise ValueError(

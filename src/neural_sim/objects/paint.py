@@ -65,7 +65,7 @@ class Paint(Visuals):
 
     @property
     def defined(self) -> bool:
-        """True if there are colours; trimesh reads this property."""
+        """Always True; trimesh asks whether there are colours."""
         return True
 
     @override
@@ -193,10 +193,12 @@ def tinted(texture: Texture, factor: Float[np.ndarray, "3"]) -> Texture:
 
 
 def read_texture(source: Path | bytes, where: str, wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")) -> Texture:
-    """Read a picture as a texture, not turned by EXIF, which texture coordinates ignore, and without opacity.
+    """Read a picture as a texture, without opacity.
+
+    It is not turned as EXIF says, because texture coordinates refer to the stored pixels.
 
     Raises:
-        ValueError: no picture can be read; the message has ``where``.
+        ValueError: no picture can be read; the message begins with ``where``.
     """
     image = read_picture(BytesIO(source) if isinstance(source, bytes) else source, where, upright=False)
     image = image.convert("RGB")
@@ -211,7 +213,7 @@ def find_named(written: str, folder: Path) -> Path | None:
     """Find a file that a mesh in ``folder`` refers to, however the machine that wrote it spelt the name.
 
     Backslashes count as separators. Case is ignored if no file has exactly this name. If there is no such file, the
-    last part of the name is looked for in ``folder``, in its sub-folders, and in a neighbouring folder ``textures``.
+    last part of the name is looked for in ``folder``, in its subfolders, and in a neighbouring folder ``textures``.
 
     Raises:
         ValueError: several files have that last part.

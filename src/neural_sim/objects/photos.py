@@ -100,7 +100,7 @@ class Photos:
         poses: finds the cameras if there are only photographs; null: they are given, by ``transforms.json`` or a COLMAP
             model.
         mask_command: with ``masks="command"``: see ``MaskCommand``.
-        mask_value: the object's value if masks are label images, or a mapping by object name; null: they are not.
+        mask_value: the object's value in label images, or a mapping by object name; null: masks are not label images.
         beside: meshes that are additional objects of the run, under other names; null: none.
         frames: number of frames to take from a video, if cameras must be found and a folder has a video instead of
             photographs.
@@ -329,7 +329,7 @@ class Photos:
         views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)
         finest = max(pixels_per_pixel(frame, views.camera) for frame in train)
         _log.info(
-            "%s: %d photographs to train on, %d to score; a pixel at views.image_size=%d is up to %.1f of theirs wide",
+            "%s: %d photographs to train on, %d to score; a pixel at views.image_size=%d spans up to %.1f of theirs",
             name, len(train), len(test), image_size, finest,
         )  # fmt: skip
         return views if self.refinement is None else self.refinement.refine(views, len(test))
@@ -340,9 +340,10 @@ class Photos:
         return self._up(name) or capture.up or mean_up(capture)
 
     def directions(self, name: str) -> Float[np.ndarray, "photos 3"]:
-        """Compute unit vectors to the cameras, in the object's frame, from its box or else from the point they look at.
+        """Compute unit vectors to the cameras, in the object's frame.
 
-        No photograph is read: masks would move the centre a little, and the directions by a few degrees.
+        They start at its box's centre or else at the point that the cameras look at. No photograph is read: masks would
+        move that centre a little, and the directions by a few degrees.
         """
         poses = np.stack([frame.camera_to_world for frame in self.captures[name].frames])
         box = self.box_of(name)

@@ -69,7 +69,7 @@ def saved_box(folder: Path) -> Corners | None:
     """Read the box that was saved in a capture's folder; None if there is none.
 
     Raises:
-        ValueError: the file is not a box; the message has its path.
+        ValueError: the file holds no box; the message names the file.
     """
     file = folder / BOX_FILE
     if not file.is_file():
@@ -88,7 +88,7 @@ class Pictures:
     ``masks`` is the source of the object's mask. ``files``: the frame's ``mask_path``, or an image with its name in a
     folder ``masks`` next to the images or the capture's file; ``alpha``: the image's alpha channel; ``auto``: the
     first of these that a frame has; ``scene`` and ``command``: ``computed``, with a mask of any size for each of the
-    capture's frames, in their order. If mask files are label images, the object has ``value``.
+    capture's frames, in their order. In label images, the object's pixels have ``value``.
 
     Raises:
         ValueError: the number of computed masks is wrong. ``rgba`` raises it if a frame has no mask, or one of another
@@ -197,11 +197,8 @@ def mask_beside(image: Path, source: Path) -> Path | None:
     levels = len(Path(whole).parts) - len(Path(home).parts) + 1
     for folder in [image.parent, *image.parent.parents][: max(2, levels)]:
         below = image.parent.relative_to(folder)
-        inner = [
-            below,
-            Path(*below.parts[1:]),
-            Path(),
-        ]  # also without the images' own folder, and by the file's name alone
+        # The images' own folder may be missing among the masks, or all subfolders.
+        inner = [below, Path(*below.parts[1:]), Path()]
         for part in dict.fromkeys(inner):
             for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
                 if (folder / MASKS_FOLDER / part / name).is_file():

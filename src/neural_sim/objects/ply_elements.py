@@ -94,7 +94,7 @@ def _read_binary(elements: Sequence[Element], data: bytes, order: Order) -> None
 
 
 def _rows_of_bytes(element: Element, data: bytes, start: int, order: Order) -> int:
-    """Read an element's columns, all rows at once if their lists have the first row's lengths."""
+    """Read an element's columns and return where they end; rows whose lists are equally long are read at once."""
     lengths = _lengths_at(element, data, start, order)
     fields: list[tuple] = []
     for number, (item, length) in enumerate(zip(element.properties, lengths, strict=True)):
@@ -188,7 +188,9 @@ def _rows_of_words(element: Element, words: Sequence[bytes], start: int) -> int:
             count = 1
             if item.lengths is not None:
                 count, start = int(words[start]), start + 1
-            if count < 0 or start + count > len(words):
+            if count < 0:
+                raise ValueError(f"a list of {element.name} has length {count}")
+            if start + count > len(words):
                 raise IndexError
             column.append(_typed(np.array(words[start : start + count], dtype=np.float64), item))
             start += count
@@ -197,9 +199,9 @@ def _rows_of_words(element: Element, words: Sequence[bytes], start: int) -> int:
 
 
 def _typed(values: Shaped[np.ndarray, "n"], item: Property) -> Shaped[np.ndarray, "n"]:
-    """Return numbers in a property's type, which must hold them."""
+    """Convert numbers to a property's type if it is an integer, which must be able to hold them."""
     if item.kind.kind == "f":
-        return values  # in double precision, to keep all digits of the text
+        return values  # stays in double precision, to keep all digits of the text
     limits = np.iinfo(item.kind)
     if not ((values >= limits.min) & (values <= limits.max) & (values == np.rint(values))).all():
         raise ValueError(f"{item.name} has a value that its type {item.kind} cannot hold")

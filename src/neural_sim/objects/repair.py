@@ -23,15 +23,15 @@ OUTLIER = 1.5
 
 
 def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
-    """Copy a mesh so that it can be rendered, and log every repair as a warning.
+    """Return a copy of a mesh that can be rendered, and warn about every repair.
 
     The copy has finite normals and colours, and no degenerate faces. If a normal is not finite or too short, all are
     recomputed from the faces. A mesh without colours, or with a missing texture, gets its material's colour or grey.
-    More than ``HUGE_FACES`` faces only give a warning. Vertices without a face, which the parts of glTF files often
-    have, are dropped without one.
+    More than ``HUGE_FACES`` faces only give a warning. Vertices that no face uses, common in the parts of glTF files,
+    are dropped without a warning.
 
     Raises:
-        ValueError: no face has positive area and finite vertices; the message has ``source``.
+        ValueError: no face has positive area and finite vertices; the message begins with ``source``.
     """
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or len(mesh.vertices) == 0:
         raise ValueError(f"{source}: object {name!r} has no faces; want a triangle mesh")
@@ -90,7 +90,7 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
     if not bad.any():
         return mesh
     log.warning(
-        "%s: object %r: %d of %d normals were not of unit length; all are recomputed",
+        "%s: object %r: %d of %d normals are too short or not finite; all are recomputed",
         source, name, int(bad.sum()), len(bad),
     )  # fmt: skip
     # A new mesh has none of the file's normals, so trimesh computes them from the faces.

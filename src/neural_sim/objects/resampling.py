@@ -112,9 +112,9 @@ def _view(
 
 
 def _window(frame: Frame, pose: Tensor, turned: Tensor, camera: PinholeCamera) -> tuple[int, int, int, int]:
-    """Return first and last rows and columns of a view between which the photograph lies, with a pixel to spare.
+    """Return (top, bottom, left, right) of the part of a view in which the photograph lies, with a pixel to spare.
 
-    A view that shows the whole object from nearby is many times as wide as the photograph.
+    Only that part is sampled: a view that shows the whole object from nearby is many times as wide as the photograph.
     """
     _, seen = _projected(frame, pose, turned, camera, torch.arange(camera.width * camera.height))
     found = seen.view(camera.height, camera.width)

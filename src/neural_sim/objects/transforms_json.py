@@ -104,7 +104,7 @@ def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> dict[str, Any]:
-    """Apply nerfstudio's lists: ``val`` and ``test`` are test frames; with a ``train``, unlisted ones are left out."""
+    """Apply nerfstudio's lists: ``val`` and ``test`` are test frames; with a ``train`` list, others are left out."""
     lists = {part: document[f"{part}_filenames"] for part in PARTS if f"{part}_filenames" in document}
     if not lists:
         return document
@@ -206,7 +206,7 @@ def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
             f"{where}: {strange[0]}: lenses with this key are not supported; undistort the photographs"
         )
     if "fl_x" not in values and "camera_angle_x" not in values:
-        raise ValueError(f"{where}: want intrinsics fl_x or camera_angle_x, of the frame or of the file")
+        raise ValueError(f"{where}: want intrinsics fl_x or camera_angle_x, in the frame or in the file")
     fx = number("fl_x", 0.0) if "fl_x" in values else focal("camera_angle_x", width)
     fy = fx
     if "fl_y" in values:

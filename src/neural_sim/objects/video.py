@@ -37,7 +37,7 @@ def can_be_captured(folder: Path) -> bool:
 
 
 def take_frames(folder: Path, name: str, count: int) -> None:
-    """Write frames of a folder's video into its folder ``images``, unless it has photographs.
+    """Write frames of a folder's video into its subfolder ``images``, unless there are photographs already.
 
     The video is cut into ``count`` equal parts, and the sharpest frame of each is kept, upright.
 

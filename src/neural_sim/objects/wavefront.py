@@ -123,7 +123,7 @@ def _material(
     faces: int,
     coloured: bool,
 ) -> Material:
-    """Return the material with this name; for faces without a material, the only one (logged), or a plain one."""
+    """Return the material with this name; for faces without one, the only one (logged) or a plain one."""
     if name in materials:
         return materials[name]
     if coloured:
@@ -191,7 +191,7 @@ def _kd(rest: str, where: str) -> tuple[float, float, float]:
 
 
 def _map(material: Material, rest: str, library: Path, where: str) -> None:
-    """Read ``map_Kd`` with its options; if the whole text, without options, is the name of a file, it is that file."""
+    """Read a ``map_Kd``: its options, if any, and the texture's file name, which may contain spaces."""
     found = find_named(rest, library.parent) if not rest.startswith("-") else None
     if found is None:
         words = rest.split()
