@@ -340,10 +340,9 @@ class Photos:
         return self._up(name) or capture.up or mean_up(capture)
 
     def directions(self, name: str) -> Float[np.ndarray, "photos 3"]:
-        """Compute unit vectors to the cameras, in the object's frame.
+        """Compute directions, in the object's frame, to the cameras from the box's centre or else the point they look at.
 
-        They start at its box's centre or else at the point that the cameras look at. No photograph is read: masks would
-        move that centre a little, and the directions by a few degrees.
+        No photograph is read: masks would move that point a little, and the directions by a few degrees.
         """
         poses = np.stack([frame.camera_to_world for frame in self.captures[name].frames])
         box = self.box_of(name)
