@@ -340,7 +340,7 @@ class Photos:
         return self._up(name) or capture.up or mean_up(capture)
 
     def directions(self, name: str) -> Float[np.ndarray, "photos 3"]:
-        """Compute directions, in the object's frame, to the cameras from the box's centre or else the point they look at.
+        """Compute unit vectors to the cameras, in the object's frame, from its box's centre or where the cameras look.
 
         No photograph is read: masks would move that point a little, and the directions by a few degrees.
         """
