@@ -116,7 +116,7 @@ def test_seeds_that_a_method_lacks_are_named():
     assert groups[0].seeds == (1, 2)
     assert reasons(left_out) == {
         "20": "ours has no run of seed 7", "15": "ours has no run of seed 4", "1": "there is no run of seed 0 of lts",
-        "21": "it shares no seed with all of ours, lts",
+        "21": "no seed is common to it and ours, lts",
     }  # fmt: skip
 
 

@@ -79,7 +79,7 @@ def test_the_mean_of_trainings_has_students_interval_where_images_do_not_matter(
     # Training by training: 0.2, 0.3, 0.1.
     assert found.ahead("learned", "ns").value == pytest.approx(0.2, abs=0.005)
     assert half(found.ahead("learned", "ns")) == pytest.approx(T2 * 0.1 / 3**0.5, rel=0.02)
-    assert not found.ahead("learned", "ns").certain and "No difference can be told" in sentence(found, "AP")
+    assert not found.ahead("learned", "ns").certain and "No difference can be seen" in sentence(found, "AP")
 
 
 def test_what_all_trainings_gain_is_certain_however_they_scatter():

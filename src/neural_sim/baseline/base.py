@@ -75,7 +75,7 @@ class Response:
     """Steps of psi along the finite-difference response of training, without a derivative (``outer.response``).
 
     The response takes one training at psi and one for each bin of each factor, in which every object moves the
-    fraction ``part`` of its images to one bin.
+    fraction ``part`` of its images to that bin.
     """
 
     name: str

@@ -36,8 +36,8 @@ class LearningToSimulate:
         deviation: standard deviation of the policy, in logits of bins.
         light_deviation: standard deviation of the policy, in weights of lights.
         samples: K, the number of settings for each step.
-        decay: decay of the moving averages of rewards (b; the first step, which has no earlier ones, uses the mean of
-            its own settings) and of squared advantages.
+        decay: decay of the moving averages of rewards (b) and of squared advantages. In the first step, which has no
+            earlier rewards, b is the mean over its own settings.
         rounds: number of settings for each outer iteration in the budget; two take about as long as one hypergradient.
     """
 

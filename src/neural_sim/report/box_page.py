@@ -117,7 +117,7 @@ class BoxPage:
         return f"http://127.0.0.1:{self.server.get_port()}"
 
     def moved(self) -> None:
-        """Read the box off the dragged corners."""
+        """Read the box from the dragged corners."""
         self.box = _sorted(*(np.asarray(handle.position) for handle in self.handles))
         self.show()
 

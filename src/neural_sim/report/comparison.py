@@ -23,9 +23,9 @@ from neural_sim.report.tracking import UNKNOWN
 BUDGETS = 6
 """Number of times at which the methods are compared, evenly spaced in log seconds."""
 ONLY_AT_END = (
-    "Some runs were scored only at their end and keep the score of their start until then, so that areas, and scores "
-    "and leads after fewer seconds, do not tell who is ahead. With score_at=[0.25,0.5], a run is also scored on its "
-    "way."
+    "Some runs were scored only at their start and their end. Until the end, they count with the score of their start, "
+    "so areas, and scores and leads after fewer seconds, do not show which method is ahead. With "
+    "score_at=[0.25,0.5], a run is also scored on its way."
 )
 SPENT = ("images", "detector_steps", "products")
 Clock = Literal["seconds", "cpu_seconds"]
@@ -36,8 +36,8 @@ Clock = Literal["seconds", "cpu_seconds"]
 class Comparison:
     """A comparison of the methods of one setting, over the seeds that all of them have.
 
-    Scores are means over the biased objects. If some run was scored only at its end (``only_at_end``), scores and leads
-    before the end do not show which method is ahead.
+    Scores are means over the biased objects. If some run was scored only at its start and end (``only_at_end``), scores
+    and leads before the end do not show which method is ahead.
 
     Args:
         setting: the experiment and its gap.
@@ -58,7 +58,7 @@ class Comparison:
             keeps its last score.
         clock: how seconds are measured.
         score: the kind of score.
-        only_at_end: whether some run was scored only once.
+        only_at_end: whether some run was scored only at its start and end.
     """
 
     setting: str

@@ -46,7 +46,7 @@ def check_database(database: Path) -> None:
             if file.read(len(_SQLITE)) != _SQLITE:
                 raise ValueError(f"paths.mlflow: {database} is not an SQLite database; {todo}")
         with closing(
-            # Not read-only, so that SQLite rolls back what a killed process left half written in the journal.
+            # Not read-only, so that SQLite can use its journal to roll back what a killed process left half written.
             sqlite3.connect(database.as_uri() + "?mode=rw", uri=True, timeout=_PATIENCE)
         ) as connection:
             connection.execute("select count(*) from sqlite_master").fetchone()

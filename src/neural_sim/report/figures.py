@@ -69,7 +69,7 @@ def titled(figure: Figure, text: str, fontsize: float = 11.0) -> None:
 
 
 def psi_figure(learned: Sequence[Learned], title: str) -> Figure:
-    """Draw one panel per object: P over a factor's bins, stacked by iteration, next to the target's."""
+    """Draw one panel per object: the probabilities of a factor's bins by iteration, next to the target's."""
     columns = min(3, len(learned))
     rows = -(-len(learned) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.5 * rows + 0.9), layout="constrained")

@@ -41,9 +41,9 @@ def identity(
 
     Returns:
         ``scoring``: digest of everything that must be equal for the AP of two methods to be comparable;
-        ``configuration``: digest of all settings but ``RUN_KEYS``, which a method's seeds share; ``test_set``: digest
-        of the test images and labels; ``config``, ``files`` and ``code``, to report differences; and the ``commit`` of
-        the code, None outside a checkout.
+        ``configuration``: digest of the method's code and all settings but ``RUN_KEYS``, the same for all of a method's
+        seeds; ``test_set``: digest of the test images and labels; ``config``, ``files`` and ``code``, to report
+        differences; and the ``commit`` of the code, None outside a checkout.
     """
     scored = {"config": scored_config(config), "files": files, "names": list(files["objects"])}
     settings = {key: value for key, value in config.items() if key not in RUN_KEYS}

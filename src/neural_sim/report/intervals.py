@@ -5,7 +5,7 @@ A few seeds say little about their own scatter, so intervals use Student's quant
 cover the truth in only 81, 86 and 92 of 100 cases with 2, 3 and 5 seeds. If all seeds share the test images, as
 trainings repeated on one target do, the test images' part of the variance does not shrink with the number of seeds. It
 is therefore added in quadrature. If each seed has test images of its own, the scatter between seeds already includes
-that part, and intervals are slightly too wide: they cover 98 of 100.
+that part, and intervals are slightly too wide: they cover the truth in 98 of 100 cases.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 ONNX = "model.onnx"
 CHECKED = 50
-"""Test images on which onnxruntime is compared with torch."""
+"""Largest number of test images on which onnxruntime is compared with torch."""
 NAME = "detector"
 """The name of the model in the run."""
 CODE = Path(__file__).parent / "pyfunc_model.py"

@@ -102,7 +102,7 @@ class Made:
 def caution(scale: str) -> str:
     """Return a warning if scores at this scale mean nothing; empty for other scales."""
     return (
-        f"A trial (scale={scale}): it shows that everything runs, and its scores mean nothing."
+        f"A trial (scale={scale}): it shows that everything runs, but its scores mean nothing."
         if scale == SMALLEST
         else ""
     )

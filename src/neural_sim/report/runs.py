@@ -375,7 +375,7 @@ def _at_common_seeds(runs: Mapping[str, Sequence[FinishedRun]], reference: str) 
             chosen.append(method)
             seeds &= set(of[method])
         else:
-            reason = f"it shares no seed with all of {', '.join(chosen)}"
+            reason = f"no seed is common to it and {', '.join(chosen)}"
             left += [LeftOut.of(run, reason) for run in of[method].values()]
 
     for run in (run for method in chosen for run in of[method].values() if run.seed not in seeds):

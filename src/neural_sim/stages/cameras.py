@@ -141,7 +141,7 @@ def _lens(stored: list[Any]) -> Lens:
 
 @dataclass(frozen=True)
 class MasksStage(_StoredMasks):
-    """Masks of an object's photographs, computed from the geometry of the scene; those without a camera have none.
+    """Masks of an object's photographs, computed from the scene's geometry; photographs without a camera have none.
 
     They do not depend on the run's seed, so runs with different seeds share them.
 
@@ -170,7 +170,7 @@ class MasksStage(_StoredMasks):
 
 
 def command_masks(source: Photos, name: str) -> CommandMasksStage | None:
-    """Return the stage that computes an object's masks by a command, None if no command is set."""
+    """Return the stage that computes an object's masks with a command, None if no command is set."""
     if source.command is None:
         return None
     return CommandMasksStage(name, source.found_digest(name), source.command, source)

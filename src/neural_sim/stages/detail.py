@@ -21,7 +21,7 @@ from neural_sim.types import PinholeCamera
 _log = logging.getLogger(__name__)
 
 ENOUGH = 1.25
-"""The run's own fields are used for images of up to this many times the resolution of their views."""
+"""The run's own fields are used for images with up to this many times the resolution of the fields' views."""
 
 
 def view_size_for(
@@ -82,7 +82,7 @@ def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[Fie
     _log.info(
         "export: images of %d x %d resolve as much as views of %d pixels a side; fields are fitted to views of %d%s",
         camera.width, camera.height, wanted, size,
-        f" (export.largest_views; each pixel fills {wanted / size:.1f} pixels of an image)" if size < wanted else "",
+        f" (export.largest_views; each view pixel covers {wanted / size:.1f} image pixels)" if size < wanted else "",
     )  # fmt: skip
     if size == views.image_size:
         return graph.fields

@@ -49,7 +49,7 @@ class Run:
 
     Raises:
         UserError: several processes would share a GPU.
-        ValueError: a cluster is asked for, and Ray is not installed.
+        ValueError: a cluster is asked for, but Ray is not installed.
     """
 
     name: str

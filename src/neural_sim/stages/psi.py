@@ -60,10 +60,10 @@ class HypergradientParts:
 class PsiStage(Stage[LearnedPsi]):
     """The psi that ``method`` learns from the initial distribution.
 
-    ``pool`` has the renders that a loop reuses. ``parts`` is for methods that follow the hypergradient and ``shown``,
-    the estimate from the target's boxes, for label shift; both are None for other methods. ``symmetries`` are the
-    groups of bins that ``outer.first_step`` cannot tell apart in the boxes. ``on_record`` is called at the end of each
-    iteration with its record.
+    ``pool`` has the renders that a loop reuses. ``parts`` is None except for methods that follow the hypergradient.
+    ``shown``, the estimate from the target's boxes, is None except for label shift. ``symmetries`` are the groups of
+    bins that ``outer.first_step`` cannot tell apart in the boxes. ``on_record`` is called at the end of each iteration
+    with its record.
 
     Raises:
         ValueError: the backbone has fewer stages than ``outer.loop_layers``, or the detector has too many parameters
@@ -96,8 +96,8 @@ class PsiStage(Stage[LearnedPsi]):
             size = sum(value.numel() for value in trained.values())
             if size > largest:
                 raise ValueError(
-                    f"solver=exact takes up to {largest} unknowns (solver.linear.max_size), the detector has {size}: "
-                    "want solver=cg or detector=micro"
+                    f"solver=exact takes up to {largest} unknowns (solver.linear.max_size), but the detector has "
+                    f"{size}: want solver=cg or detector=micro"
                 )
 
     @property
@@ -156,7 +156,7 @@ class PsiStage(Stage[LearnedPsi]):
         return RewardLoop(inner, self.initial, method, generator)
 
     def _first_step(self, results: Results, whole: bool) -> FirstStep | None:
-        """Return the proposal for the first step of the loop, None if that follows the derivative."""
+        """Return the proposal for the loop's first step, None if that step follows the derivative."""
         settings = self.outer.first_step
         if isinstance(settings, Derivative):
             return None

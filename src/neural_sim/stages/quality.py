@@ -1,4 +1,4 @@
-"""Stage ``quality``: scores and pictures that tell how well a field shows its object."""
+"""Stage ``quality``: scores and pictures that show how well a field represents its object."""
 
 from __future__ import annotations
 

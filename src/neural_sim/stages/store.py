@@ -5,7 +5,7 @@ A lock keeps two processes from computing the same result: other runs wait for t
 freed when its process ends.
 
 An entry is a line of text with the SHA-256 and the size of the rest of the file, followed by the output of
-``torch.save``. Both are checked on every read; an entry that a disk or a copy has damaged is set aside and made again.
+``torch.save``. Both are checked on every read; a damaged entry is set aside and made again.
 Checkpoints of unfinished work are kept next to the entries, in the same format, until the result is finished.
 """
 
@@ -111,8 +111,8 @@ class Store:
     def state(self, kind: str, key: str, classes: Sequence[type] = ()) -> Any:
         """Return the state of unfinished work on the result ``key``, None if there is none.
 
-        To be called by the process that makes the result and holds its lock. ``classes`` are the dataclasses that may
-        occur in a state. A damaged checkpoint is set aside, with a warning, and the work starts again.
+        Only the process that makes the result, and holds its lock, may call this. ``classes`` are the dataclasses that
+        may occur in a state. A damaged checkpoint is set aside, with a warning, and the work starts again.
         """
         path = self._path(kind, key).with_suffix(CHECKPOINT)
         try:
@@ -129,7 +129,7 @@ class Store:
                 path.parent.mkdir(parents=True, exist_ok=True)
             _write(path, lambda file: _save(state, file))
         except ValueError as error:
-            _log.warning("%s; the work goes on, but a later run could not resume it from here", error)
+            _log.warning("%s; the work goes on, but a later run cannot resume it from here", error)
 
     def revise(self, kind: str, key: str, change: Callable[[Any], State | None]) -> None:
         """Change the state of unfinished work to which several processes write, one at a time.
@@ -152,7 +152,7 @@ class Store:
                 else:
                     self.keep(kind, key, state)
         except ValueError as error:
-            _log.warning("%s; the work goes on, but a later run could not resume it from here", error)
+            _log.warning("%s; the work goes on, but a later run cannot resume it from here", error)
 
     def forget(self, kind: str, key: str) -> None:
         """Remove the checkpoint of the result ``key``, if there is one."""
@@ -198,9 +198,9 @@ class _Damage(Exception):
 
 @contextmanager
 def locked(path: Path, wait: bool = True, key: str = "paths.store") -> Iterator[bool]:
-    """Lock an entry. The operating system frees the lock when its process ends, however it ends.
+    """Lock an entry. The operating system frees the lock when the process that holds it ends, however it ends.
 
-    Yields whether this process got the lock, which is certain only with ``wait``. Messages name ``key``, the setting
+    Yields whether this process got the lock; with ``wait``, it always does. Messages name ``key``, the setting
     that ``path`` comes from.
     """
     lock = _lock(path)

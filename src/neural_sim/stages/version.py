@@ -104,7 +104,7 @@ def _source(name: str, root: Path) -> Path | None:
 
 
 def _without_docstrings(tree: ast.AST) -> ast.AST:
-    """Drop every statement that is only a string: docstrings, also those below attributes and constants."""
+    """Drop every statement that is only a string: docstrings, including those below attributes and constants."""
     for node in ast.walk(tree):
         for name in ("body", "orelse", "finalbody"):
             body = getattr(node, name, None)

@@ -107,7 +107,7 @@ class Objects(ABC):
 
     source: Source
     has_meshes: ClassVar[bool]
-    """Whether objects can be rendered without their fields."""
+    """Whether all objects can be rendered without their fields."""
 
     @staticmethod
     def of(source: MeshSource | Photos, views: Views) -> Objects:

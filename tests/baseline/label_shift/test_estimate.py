@@ -244,7 +244,7 @@ def test_renders_that_are_not_told_apart_move_nothing(posed):
     # The accuracy on so few held-out renders may by chance be above the limit; the likelihood is flat all the same.
     assert {one.finding for one in same.factors} <= {"not told apart", "stays"}
     torch.testing.assert_close(same.psi, psi.double())
-    assert "its pose cannot be told from renders" in replace(lamp, finding="not told apart").sentence
+    assert "its pose cannot be read from renders" in replace(lamp, finding="not told apart").sentence
 
 
 def test_an_estimate_that_may_be_far_off_moves_psi_only_if_psi_is_farther_off(posed, found):

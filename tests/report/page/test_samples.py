@@ -31,3 +31,5 @@ def test_the_page_counts_labels_and_shows_images(tmp_path):
     assert len(sources) == 3 and all(source.startswith("data:image/jpeg") for source in sources)
     alone = write_samples_page(tmp_path, records[:1], ["can", "mug"], {}).read_text()
     assert "1 image, without a split." in alone
+    empty = write_samples_page(tmp_path, records[:2], ["can", "mug"], {}).read_text()
+    assert "2 images, without a split; 1 shows no labelled object." in empty

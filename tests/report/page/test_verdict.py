@@ -77,7 +77,7 @@ def test_a_loss_is_called_one():
 def test_what_cannot_be_told_is_not_claimed():
     none = gain(20, 20, 20)
     assert none.outcome == "no difference" and none.closed is None
-    assert verdict(none).startswith("No difference can be told") and "would give +0.0" in verdict(none)
+    assert verdict(none).startswith("No difference can be seen") and "would give +0.0" in verdict(none)
 
 
 def test_without_a_gap_the_target_is_not_mentioned():

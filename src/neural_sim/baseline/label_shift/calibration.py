@@ -1,8 +1,8 @@
 """Two guesses of a crop's bins, by the network and by the size of the box alone, and their calibrated posterior.
 
 A network trained on few renders memorises them: with four bins of distance, it recognised half of the held-out renders,
-while the size of the box alone recognises nine in ten. A quadratic logistic regression therefore reads the box, and
-held-out renders determine how much to trust each guess (Wolpert 1992): posteriors are the softmax of
+while the size of the box alone sufficed to recognise nine in ten. A quadratic logistic regression therefore reads the
+box, and held-out renders determine how much to trust each guess (Wolpert 1992): posteriors are the softmax of
 a_1 z_1 + a_2 z_2 + b, with weights a >= 0 for the logits z of each guess and a bias b for each combination of bins.
 """
 
@@ -29,7 +29,7 @@ class BoxReader:
         high: largest value of each number in the fit; larger values are lowered to it.
         centre: means of the numbers.
         spread: their standard deviations; 1 for numbers that do not vary.
-        weights: the coefficients of each factor: of a constant, the numbers and their products.
+        weights: for each factor, the coefficients of a constant, of the numbers and of their products.
         cells: the combinations of bins.
     """
 
@@ -44,7 +44,7 @@ class BoxReader:
     def fitted(
         numbers: Float[Tensor, "n d"], known: Int[Tensor, "n"], cells: Cells, ridge: float = 1.0
     ) -> BoxReader:
-        """Fit to boxes of renders in ``known`` cells, with a penalty of ``ridge`` / 2 times the squared weights.
+        """Fit to boxes of renders whose cells are ``known``, with a penalty of ``ridge`` / 2 times the squared weights.
 
         The weights of constants are not penalised.
         """

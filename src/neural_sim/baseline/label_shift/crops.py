@@ -23,15 +23,15 @@ from neural_sim.types import LabelledImages
 SIDE = 32
 """Side of the network's input, in pixels."""
 MARGIN = 1.5
-"""Side of a stored crop, in multiples of the box's longer side: it contains nearly all of a rotated and shifted view,
-the rest of which repeats the crop's border."""
+"""Side of a stored crop, in multiples of the box's longer side. It contains nearly all of a rotated and shifted view;
+beyond it, the crop's border is repeated."""
 _STORED = 44
-_COVERED = 0.75  # fraction of an image in boxes above which too little is left around them to compare
+_COVERED = 0.75  # if boxes cover more of an image than this, too little is left around them to compare
 _SHOWN = 1.1  # side of the network's view, in multiples of the box's longer side
 BOX_NUMBERS = 5
 """How many numbers describe a box."""
 SIZE = (0, 1, 4)
-"""The indices of those that describe its size: width, height and whether the border may cut it off."""
+"""The indices of the numbers that describe its size: width, height and whether the border may cut it off."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ def crops_of(images: LabelledImages, whole: bool) -> Crops:
 
 
 def views_of(images: LabelledImages, whole: bool) -> Int[Tensor, "boxes"]:
-    """Return the numbers of the views that boxes show; near-duplicates, such as frames of one video, share a view.
+    """Return the number of the view that each box shows; near-duplicates, such as frames of one video, share a view.
 
-    Two boxes show one view if they have the same label, overlap by half, and their images look alike
-    (``target.split``), also outside all boxes, because independent photographs may show an object in the same pose.
-    With ``whole``, only the label and the image count. Boxes of a chain of such pairs show one view. The order is that
-    of ``crops_of``.
+    Two boxes show one view if they have the same label and overlap by half, and if their images look alike
+    (``target.split``), even outside all boxes: independent photographs, too, may show an object in the same pose. With
+    ``whole``, only the label and the image count. All boxes that a chain of such pairs connects show one view. The
+    order is that of ``crops_of``.
     """
     alike = torch.ones(len(images), len(images), dtype=torch.bool)
     for outside in (False,) if whole else (False, True):
@@ -116,7 +116,7 @@ def views_of(images: LabelledImages, whole: bool) -> Int[Tensor, "boxes"]:
 
 
 def _thumbnail(images: LabelledImages, row: int, outside: bool) -> Float[Tensor, "24 24"]:
-    """Return the thumbnail of an image, ``outside`` its boxes unless they cover most of it.
+    """Return the thumbnail of an image; with ``outside``, its boxes are blanked out unless they cover most of it.
 
     Plain borders are cut off first, because their edges would make all letterboxed photographs look alike.
     """

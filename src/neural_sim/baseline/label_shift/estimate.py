@@ -2,11 +2,11 @@
 
     estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
 
-Renders of all bins, from a pool that is rendered once, train a small classifier of bins (``network``) and another that
-uses only the size of boxes (``calibration``). Both classify the target's boxes. Expectation maximisation over their
-calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each bin;
-weights of lights come from matching moments (``moments``). A factor of ``Estimate.psi`` moves only if the target
-differs significantly from the present psi, and if there are enough boxes, they look like renders (``evidence``), the
+A small classifier of bins (``network``), and another that uses only the size of boxes (``calibration``), are trained on
+renders of all bins, from a pool that is rendered once. Both classify the target's boxes. Expectation maximisation over
+their calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each
+bin; weights of lights come from matching moments (``moments``). A factor of ``Estimate.psi`` moves only if the target
+differs significantly from the present psi, there are enough boxes, these look like renders (``evidence``), the
 classifier recognises renders, and the estimate is precise enough.
 """
 
@@ -41,7 +41,7 @@ class Estimate:
     Attributes:
         factors: the estimates of all factors, object by object.
         psi: the present psi, in which estimates replace the factors that move.
-        images: number of crops of renders, for training and held out.
+        images: number of crops of renders, those for training and those held out.
         seconds: duration.
         cpu_seconds: processor seconds by phase: pool, images, network, evidence.
     """

@@ -119,7 +119,7 @@ class FactorEstimate:
                 why = f"weights explain {explained:.0%} of the variance of guesses on held-out ones"
             if not self.converged:
                 why = f"the likelihood is flat; {why}"
-            return f"{self.name}: its {self.factor} cannot be told from renders ({why}), so psi stays"
+            return f"{self.name}: its {self.factor} cannot be read from renders ({why}), so psi stays"
         if self.finding == "uncertain":
             return (
                 f"{self.name}: its boxes do not determine its {self.factor} (the estimate may be off by "

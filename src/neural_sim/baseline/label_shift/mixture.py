@@ -116,8 +116,8 @@ def maximise(
     """Find the most probable mixture by expectation maximisation, starting from equal probabilities.
 
     Args:
-        likelihood: likelihood of each box in every cell, up to a factor for each box; not negative, and positive
-            somewhere for every box.
+        likelihood: likelihood of each box in every cell, up to a factor for each box; not negative, and for every box
+            positive in at least one cell.
         cells: the combinations of bins.
         prior: number of boxes that the Dirichlet prior adds to every bin.
         fixed: given distributions, by the position of their factor.
@@ -148,7 +148,7 @@ def maximise(
 def log_likelihood(
     likelihood: Float[Tensor, "*batch boxes cells"], joint: Float[Tensor, "*#batch cells"]
 ) -> Float[Tensor, "*batch"]:
-    """Compute the logarithm of the boxes' likelihood in a mixture."""
+    """Compute the logarithm of the boxes' likelihood under a mixture."""
     return (likelihood * joint[..., None, :]).sum(-1).clamp_min(1e-300).log().sum(-1)
 
 
@@ -174,7 +174,7 @@ def posterior(
 
     The Dirichlet prior has the parameter ``prior``, so that, given the boxes' cells, the mean of p is the update of
     ``maximise``. (With ``prior`` + 1, that would be the mode, and a bin with nearly all boxes would get too little
-    probability.) If the likelihood itself was estimated, the chains are divided among ``samples`` of it.
+    probability.) If the likelihood itself was estimated, the chains are divided among its ``samples``.
 
     Returns:
         ``chains`` x ``kept`` draws of every factor's probabilities, [draws, k].

@@ -8,8 +8,9 @@ boxes, ybar (indirect inference, Gourieroux, Monfort and Renault 1993):
     w = argmin (ybar - B w)^T S^-1 (ybar - B w),    S = cov(ybar).
 
 There are two guesses of each weight: the network's, and one that is linear in the colours of a crop's quarters, because
-light is additive. S says which to trust: the colours, if few renders trained the network. Covariances between the two
-are set to 0: otherwise the systematic errors of one would be used to correct the other.
+light is additive. S determines how far each is trusted; if the network was trained on few renders, the colours count
+more. Covariances between the two are set to 0: otherwise the systematic errors of one would be used to correct the
+other.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Response:
         lights = weights.shape[1]
         own = torch.arange(guesses.shape[1]) // lights
         scatter = left.T @ left / max(len(left) - lights, 1) * (own[:, None] == own)
-        # Weights sum to 1 and guesses nearly do, so that their scatter alone is nearly singular.
+        # Weights sum to 1 and guesses nearly do, so their scatter alone is nearly singular.
         least = (0.03 * scatter.diagonal()).clamp_min(1e-12).diag()
         # Images of one render have similar errors, and count once.
         several = len(weights) / len(weights.unique(dim=0))

@@ -161,7 +161,7 @@ class Outputs:
         return len(self.features)
 
     def averaged(self, views: Int[Tensor, "n"]) -> Outputs:
-        """Average the outputs of each view: equal ``views`` are one observation, made more than once."""
+        """Average the outputs of each view: crops with equal ``views`` are one observation, made more than once."""
         found, index, counts = views.unique(return_inverse=True, return_counts=True)
         if len(found) == len(views):
             return self

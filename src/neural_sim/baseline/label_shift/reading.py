@@ -34,7 +34,7 @@ NEVER = -1e3
 BEYOND_ALL = 0.995
 """Limit of ``strange`` if psi has lights only: all boxes share one light, so either all of them are strange or none."""
 CALIBRATIONS = 20
-"""Number of bootstrap samples of the held-out renders, whose calibrations scatter by a calibration's error."""
+"""Number of bootstrap samples of the held-out renders. Calibrations on these scatter as much as one of them errs."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class _Object:
         """Estimate all factors with bins together: boxes are a mixture of combinations of their bins.
 
         Returns:
-            The estimates by factor, and a weight for each held-out render that makes cells as frequent as in the boxes.
+            The estimates by factor, and weights with which held-out renders show each cell as often as the boxes do.
         """
         settings, generator = self.reader.settings, self.reader.generator
         factors = self.reader.distribution.binned

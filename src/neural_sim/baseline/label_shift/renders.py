@@ -15,7 +15,7 @@ from neural_sim.synthesis.pool import PooledSubject, pool_of
 from neural_sim.synthesis.scene import Scene
 
 PIXELS = 2**24
-"""Number of pixels of all renders in the images that are composed together. What a seed draws depends on it."""
+"""Largest number of pixels of the renders in images that are composed together. What a seed draws depends on it."""
 
 
 def pool_for(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
@@ -71,7 +71,7 @@ def with_bank(scene: Scene, backgrounds: int, generator: torch.Generator) -> Sce
 def known_crops(part: Scene, compositions: int, generator: torch.Generator, whole: bool) -> Known:
     """Compose images with all bins equally frequent, and cut out their boxes.
 
-    Images are composed in parts of ``PIXELS`` and thrown away once their boxes are cut out, which bounds the memory.
+    Images are composed in batches (``PIXELS``) and discarded once their boxes are cut out, which bounds the memory.
     """
     distribution, subject = part.distribution, part.subjects[0]
     assert isinstance(subject, PooledSubject)

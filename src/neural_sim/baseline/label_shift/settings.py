@@ -18,15 +18,15 @@ class LabelShift:
     """How psi is estimated from the target.
 
     Args:
-        per_bin: number of renders of every bin and object, if the scene has no pool of them yet.
+        per_bin: smallest number of renders of every bin of each object, if the scene has no pool of them yet.
         held_out: fraction of the renders that is held out from training, for calibration and tests.
-        compositions: average number of images that show each render, on different backgrounds.
+        compositions: number of images drawn per render; the same render appears on different backgrounds.
         backgrounds: number of different backgrounds, from which each image gets one at random.
         fitting: how the classifier is trained.
         augmentation: random changes of the crops on which it is trained.
         prior: number of boxes that the Dirichlet prior adds to every bin.
-        level: significance level of the test of whether the target differs from the present psi: the fraction of
-            objects already at their target that move by chance.
+        level: significance level of the test of whether the target differs from the present psi, that is, the fraction
+            of objects already at their target that move by chance.
         draws: number of draws for the bootstrap of the test and, for lights, for the intervals.
         interval: coverage probability of the intervals.
         strange: largest probability that a box looks less like the renders than a held-out render does; above it, the

@@ -23,7 +23,7 @@ SHORTEST = 192
 OVERLAP = 0.5
 """Intersection over union from which a detection counts as right on the pages."""
 SHOWN = 0.3
-"""Smallest score of a detection that is shown, and counts as wrong, on an image without objects."""
+"""On images without objects, detections with at least this score are shown and count as wrong."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""preflight.html, which says whether an optimisation is worthwhile, by what is known before it."""
+"""preflight.html, which says whether an optimisation is worthwhile, from what is known beforehand."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Preflight:
 
     @property
     def moved(self) -> list[str]:
-        """Objects that the loop's first step would move, because the target's boxes show them elsewhere than psi."""
+        """Objects that the loop's first step would move, because the target's boxes do not show what psi says."""
         moving = [one.name for one in self.shown if one.finding in MOVING]
         return list(dict.fromkeys(moving)) if self.follows else []
 
@@ -91,7 +91,7 @@ class Preflight:
             )
             return (
                 f"Worth a run: your target shows {listed(self.moved)} differently from how they are rendered now. The "
-                f"first step goes there, and is kept if training on it scores better; {derivatives}."
+                f"first step goes to what it shows, and is kept if training on it scores better; {derivatives}."
             )
         if not names:
             return (

@@ -102,12 +102,12 @@ def _tiles(
 
 
 def comment(one: Learned, records: Sequence[Mapping[str, Any]]) -> str:
-    """Say what the chart does not show: why psi did not move, that it went back, or that it moved off the target."""
+    """Say what the chart does not: why psi did not move, that it went back, or that it moved away from the target."""
     backs = [record["taken_back"][one.name] for record in records if one.name in record["taken_back"]]
     if backs:
         kept, accepted = backs[-1]["kept"], backs[-1]["accepted"]
         where = f"to where it was after {kept} of {accepted} accepted steps" if kept else "to its start"
-        return f"At the end it went back {where}: later trainings did not bear out the others."
+        return f"At the end, it went back {where}: later trainings did not bear out the others."
     start, end = one.p["initial"], one.p["learned"]
     if 0.5 * sum(abs(a - b) for a, b in zip(start, end, strict=True)) < NEAR:
         return _why_it_stayed(one, records)

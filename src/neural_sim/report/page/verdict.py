@@ -96,7 +96,7 @@ def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1, images: 
             f"It made things worse: training on the learned distribution costs {change} on {who} ({reach})."
         )
     changes = f"changes the {score} of {who} by {points:+z.1f}"
-    text = f"No difference can be told on {images}: the learned distribution {changes} ({reach})"
+    text = f"No difference can be seen on {images}: the learned distribution {changes} ({reach})"
     return f"{text}{_of_the_room(gain)}."
 
 

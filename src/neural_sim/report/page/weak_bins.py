@@ -93,9 +93,9 @@ class Weakness:
             reached = f"training on the target's own distribution reaches {100 * self.own:.0f} here"
             share = self.own - self.score.last > 0.5 * self.lacking
             hint = (
-                "a larger share helps"
+                "a larger share would help"
                 if share
-                else "better renders or a longer training may help, its share hardly"
+                else "better renders or longer training may help, a larger share hardly"
             )
             parts.append(f"{reached}, so {hint}")
         return "; ".join(parts)
