@@ -27,6 +27,8 @@ OVERRIDES = {"experiment", "scale", "variant", "hydra", "paper"}
 BY_HAND = (
     "neural_sim.main.", "neural_sim.outer.", "neural_sim.gradient.unrolled.", "neural_sim.studies.work_precision.",
 )  # fmt: skip
+# Values that conf/ leaves null although the class wants one, so that only who uses the class must give it.
+GIVEN = {"neural_sim.tasks.predict.PredictTask": {"images": "photographs"}}
 CHOICES = sorted(
     path.relative_to(CONF).with_suffix("").as_posix()
     for path in CONF.glob("*/**/*.yaml")
@@ -94,7 +96,8 @@ def compositions():
 @pytest.fixture(scope="module")
 def made(compositions):
     """A node of everything that the configuration can make, by its target."""
-    return {node["_target_"]: node for _, plain in compositions for _, node in nodes(plain, plain)}
+    found = {node["_target_"]: node for _, plain in compositions for _, node in nodes(plain, plain)}
+    return {target: {**node, **GIVEN.get(target, {})} for target, node in found.items()}
 
 
 def said(compositions):
