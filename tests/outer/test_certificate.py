@@ -68,14 +68,14 @@ def test_a_good_step_is_kept_with_everything_recorded():
 )
 @pytest.mark.parametrize(
     ("on_untrusted", "action"),
-    [("shrink", "shrunk"), ("keep", "kept"), ("skip", "skipped")],
+    [("shrink", "shrunk"), ("keep", "taken"), ("skip", "skipped")],
 )
 def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
     found, cosine, doubt, on_untrusted, action
 ):
     certificate = judge(found, cosine, on_untrusted=on_untrusted)
     assert certificate.doubts == [doubt] and actions(certificate) == [action] * 2
-    assert certificate.void == (action not in ("shrunk", "kept"))
+    assert certificate.void == (action not in ("shrunk", "taken"))
     free = judge(found, cosine, level=None, min_cosine=None, adjoint=FREE)
     assert free.doubts == (["solver"] if doubt == "solver" else [])
 
@@ -86,6 +86,7 @@ def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
         ((0.1, 0.101), "shrink", ["kept", "shrunk"]),
         ((0.9, 0.001), "skip", ["skipped", "kept"]),
         ((0.9, 0.2), "shrink", ["shrunk", "shrunk"]),
+        ((0.9, 0.001), "keep", ["taken", "kept"]),
         ((0.9, 0.2), "skip", ["skipped", "skipped"]),
     ],
 )
@@ -214,6 +215,21 @@ def test_steps_that_were_not_trusted_are_counted():
         "judged": 0, "rejected": 0, "taken_back": {"a": back}, "cosines": [0.9, 0.1],
     }  # fmt: skip
     assert untrusted([])["untrusted"] == 0
+
+
+def test_steps_that_are_taken_in_spite_of_doubts_are_not_counted_as_trusted():
+    certificates = [
+        judge(result(residual=0.2, status=Status.MAX_STEPS), on_untrusted="keep"),
+        judge(result(p_values=(0.3, 0.01)), on_untrusted="keep"),
+    ]
+    records = [
+        {"certificate": dataclasses.asdict(certificate), "verdicts": {}, "taken_back": {}}
+        for certificate in certificates
+    ]
+    counted = untrusted(records)
+    assert counted["untrusted"] == 3 and counted["actions"] == {"taken": 3}
+    assert counted["doubts"] == {"residual": 2, "signal": 1}
+    assert not any(certificate.void for certificate in certificates)
 
 
 @pytest.mark.parametrize(

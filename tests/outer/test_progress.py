@@ -57,12 +57,19 @@ def test_the_last_one_says_what_goes_back_and_no_time_that_is_left():
 def test_a_loop_that_ends_early_says_why():
     told = iteration_line([record(0.6), record(0.5)], 9, 24.0, None)
     assert told.endswith("; 24 s; the loop ends here, because no step is left to try")
+    doubted = record(0.5, certificate=certificate(["residual"], mug=("stopped",)))
+    told = iteration_line([record(0.6), doubted], 9, 24.0, None)
+    assert told.endswith(
+        "; derivative not trusted: residual; 24 s; the loop ends here, because the derivative is not trusted"
+    )
 
 
 def test_a_round_without_a_derivative_and_a_derivative_that_is_not_trusted():
     assert iteration_line([record(0.5)], 3, 2.0, 4.0) == "psi 1/3: validation loss 0.500; 2 s, about 4 s left"
     doubted = record(0.5, certificate=certificate(["residual"], mug=("skipped",)))
-    assert "; derivative not trusted: residual; " in iteration_line([doubted], 3, 2.0, 4.0)
+    assert "; derivative not trusted: residual; 2 s" in iteration_line([doubted], 3, 2.0, 4.0)
+    kept = record(0.5, certificate=certificate(["residual"], mug=("taken",), can=("shrunk",)))
+    assert "; derivative not trusted: residual; tries mug, can; 2 s" in iteration_line([kept], 3, 2.0, 4.0)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The certificate of an iteration's hypergradient: its quality, the conditions that it fails, and what steps are taken.
+"""The certificate of an iteration's hypergradient: its quality, the conditions that it fails, and what steps follow.
 
 An iteration has one step for each object and each factor of psi. Conditions on the solve, and on the hypergradient as a
 whole, concern all steps; whether the derivative differs significantly from zero is tested for each step.
@@ -21,10 +21,9 @@ from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.ranges import validated
 
 OnUntrusted = Literal["shrink", "keep", "skip"]
-Action = Literal["kept", "shrunk", "waited", "skipped"]
-_ACTIONS: Mapping[OnUntrusted, Action] = {"shrink": "shrunk", "keep": "kept", "skip": "skipped"}
-
-
+Action = Literal["kept", "waited", "taken", "shrunk", "skipped"]
+"""What happens to a step: a trusted one is ``kept``, or ``waited``; the others are for steps that are not trusted."""
+_ACTIONS: Mapping[OnUntrusted, Action] = {"shrink": "shrunk", "keep": "taken", "skip": "skipped"}
 Actions = dict[str, dict[str, Action]]
 """The action on each step, by object and factor. A trusted step ``waited`` if the trust region does not take it yet."""
 
@@ -128,7 +127,8 @@ class Certificate:
         p_values: p-values, by object and factor, of the null hypothesis that the derivative is zero. They test this
             iteration's derivative or, for trust-region steps, the average over iterations that the steps follow.
         actions: what happens to the steps of the objects whose psi is not settled. A step is ``kept`` if no condition
-            fails and its derivative is significant. ``waiting`` then marks the steps that wait.
+            fails and its derivative is significant; ``waiting`` then marks the kept steps that wait. A step that is not
+            trusted is ``taken`` in full under ``on_untrusted=keep``.
     """
 
     adjoint: Quality | None
@@ -140,11 +140,11 @@ class Certificate:
     @property
     def void(self) -> bool:
         """Return whether this iteration's derivative is discarded; it then does not enter the momentum either."""
-        taken = {action for by_factor in self.actions.values() for action in by_factor.values()}
-        return bool(self.doubts) and not taken & {"shrunk", "kept"}
+        found = {action for by_factor in self.actions.values() for action in by_factor.values()}
+        return bool(self.doubts) and not found & {"shrunk", "taken"}
 
     def waiting(self, steps: Collection[tuple[str, str]]) -> Certificate:
-        """Mark those of ``steps`` (pairs of object and factor) that are kept as waiting."""
+        """Mark as waiting those kept steps that are among ``steps`` (pairs of object and factor)."""
         actions: Actions = {
             name: {
                 factor: "waited" if action == "kept" and (name, factor) in steps else action
@@ -190,7 +190,7 @@ def certify(
         doubts.append("not finite")
     if doubts:
         action = _ACTIONS[trust.on_untrusted]
-        if not finite and action in ("shrunk", "kept"):
+        if not finite and action in ("shrunk", "taken"):
             action = "skipped"
         actions: Actions = {name: dict.fromkeys(factors, action) for name in names}
     else:
@@ -253,9 +253,9 @@ def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     ``steps`` counts all steps, one for each certified iteration, object and factor; ``waited`` counts the trusted ones
     that waited, ``untrusted`` those that were not trusted. ``actions`` counts what happened to the latter, ``doubts``
-    the reasons: the failed conditions, or ``signal`` for a derivative that is not significant. ``judged`` counts
-    objects' steps that a training accepted or rejected, ``rejected`` only the rejected ones. ``taken_back`` has the
-    ``TakenBack`` of each object that the loop returned to an earlier psi. ``cosines`` lists every measured cosine.
+    why they were not trusted: the failed conditions, or ``signal`` for a derivative that is not significant. ``judged``
+    counts objects' steps that a training accepted or rejected, ``rejected`` only the rejected ones. ``taken_back`` has
+    the ``TakenBack`` of each object that the loop returned to an earlier psi. ``cosines`` lists every measured cosine.
     """
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [

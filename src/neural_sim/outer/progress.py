@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from neural_sim.outer.certificate import Certificate
 from neural_sim.outer.records import IterationRecord
 
-_STEPS = ("kept", "shrunk")
+_STEPS = ("kept", "taken", "shrunk")
 
 
 def iteration_line(
@@ -37,20 +37,23 @@ def iteration_line(
     if left is not None:
         time += f", about {duration(left)} left"
     elif len(records) < iterations:
-        time += "; the loop ends here, because no step is left to try"
+        doubted = last.certificate is not None and last.certificate.doubts
+        why = "the derivative is not trusted" if doubted else "no step is left to try"
+        time += f"; the loop ends here, because {why}"
     return "; ".join([*parts, time])
 
 
 def _next_steps(certificate: Certificate) -> list[str]:
     """Name the objects that move now and those that wait, and count those without a significant derivative."""
-    if certificate.doubts:
-        return [f"derivative not trusted: {', '.join(certificate.doubts)}"]
     actions = {name: set(by_factor.values()) for name, by_factor in certificate.actions.items()}
     moving = [name for name, taken in actions.items() if taken & set(_STEPS)]
+    tries = [f"tries {', '.join(moving)}"] if moving else []
+    if certificate.doubts:
+        return [f"derivative not trusted: {', '.join(certificate.doubts)}", *tries]
     waiting = [name for name, taken in actions.items() if "waited" in taken and name not in moving]
     still = len(actions) - len(moving) - len(waiting)
     return [
-        *([f"tries {', '.join(moving)}"] if moving else []),
+        *tries,
         *([f"waiting: {', '.join(waiting)}"] if waiting else []),
         *([f"no signal: {still}"] if still else []),
     ]

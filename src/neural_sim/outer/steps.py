@@ -207,7 +207,7 @@ class GradientSteps:
 
 def fractions(certificate: Certificate, names: Sequence[str], factor: str, shrink: float) -> list[float]:
     """Return the fraction of each object's step along a factor that is taken; ``shrink`` for shrunk steps."""
-    taken = {"kept": 1.0, "shrunk": shrink, "skipped": 0.0}
+    taken = {"kept": 1.0, "taken": 1.0, "shrunk": shrink, "skipped": 0.0}
     return [taken[certificate.actions[name][factor]] for name in names]
 
 

@@ -35,6 +35,8 @@ def test_free_steps_are_taken_without_a_verdict_and_doubts_are_named():
     records = [record({"a": "kept"}), record({"a": "waited"}), record({"a": "skipped"}, doubts=["solver"])]
     (row,) = step_rows(records, ["a"])
     assert [cell.kind for cell in row.cells] == ["taken", "waited", "skipped"]
+    (forced,) = step_rows([record({"a": "taken"}, doubts=["residual"])], ["a"])
+    assert forced.cells[0].kind == "taken" and "doubts: residual" in forced.cells[0].note
     assert "doubts: solver" in row.cells[2].note
 
 

@@ -154,6 +154,7 @@ SYMBOLS: Mapping[Kind, str] = {
 }  # fmt: skip
 _UNJUDGED: Mapping[str, Kind] = {
     "kept": "taken",
+    "taken": "taken",
     "shrunk": "shrunk",
     "waited": "waited",
     "skipped": "skipped",
