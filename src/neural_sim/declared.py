@@ -60,9 +60,8 @@ def declared(target: str) -> Mapping[str, Any]:
         if isinstance(line, ast.ImportFrom) and line.module in _LIGHT:
             held = _LIGHT[line.module]
             known.update({alias.asname or alias.name: held[alias.name] for alias in line.names})
-        elif isinstance(line, ast.Assign) and isinstance(
-            line.targets[0], ast.Name
-        ):  # perhaps a type's short name
+        elif isinstance(line, ast.Assign) and isinstance(line.targets[0], ast.Name):
+            # perhaps a type's short name
             known.update(_read([(line.targets[0].id, line.value)], known))
         elif isinstance(line, ast.ClassDef) and line.name == name:
             return dict(_read(_arguments(line), known))

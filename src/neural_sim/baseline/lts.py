@@ -76,9 +76,9 @@ class Policy(Search):
             [psi.new_full((f.size,), own[f.lights > 0]) for f in distribution.factors]
         )
         self._noise: list[Float[Tensor, "objects K"]] = []
-        self._rewards: list[Float[Tensor, "objects"]] = []
-        self._mean: Float[Tensor, "objects"] | None = None
-        self._variance: Float[Tensor, "objects"] | None = None
+        self._rewards: list[Float[Tensor, ""]] = []
+        self._mean: Float[Tensor, ""] | None = None
+        self._variance: Float[Tensor, ""] | None = None
 
     @property
     @override
@@ -103,17 +103,17 @@ class Policy(Search):
 
     @override
     def tell(self, reward: float) -> None:
-        self._rewards.append(torch.full_like(self._omega[:, 0], reward))
+        self._rewards.append(self._omega.new_tensor(reward))
         if len(self._rewards) < self._settings.samples:
             return
         advantages, noise = self._advantages(torch.stack(self._rewards)), torch.stack(self._noise)
         self._noise, self._rewards = [], []
         # d log pi / d omega is noise / deviation. Multiplied by the variance, it gives steps in units of the deviation.
-        score = (advantages[..., None] * noise).mean(0)
+        score = (advantages[:, None, None] * noise).mean(0)
         step = self._settings.learning_rate * self._deviation * score
         self._omega = self._distribution.constrained(self._omega + self._centred(step))
 
-    def _advantages(self, rewards: Float[Tensor, "samples objects"]) -> Float[Tensor, "samples objects"]:
+    def _advantages(self, rewards: Float[Tensor, "samples"]) -> Float[Tensor, "samples"]:
         """Compute ``R - b``, divided by its running root mean square, and update both averages."""
         mean, decay = rewards.mean(0), self._settings.decay
         before = mean if self._mean is None else self._mean

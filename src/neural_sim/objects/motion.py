@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 ALL_PAIRS = 40
 """Largest number of photographs for which ``matching="auto"`` compares every pair."""
 SKELETON = 5
-"""With ``matching="auto"``, all pairs among every fifth photograph are compared: a walk may end at its start."""
+"""``matching="auto"`` also compares every fifth photograph with every other fifth one: a walk may end at its start."""
 LARGE = 800
 """Longer side in pixels from which features are searched for only at the photographs' own size."""
 BATCH = 8

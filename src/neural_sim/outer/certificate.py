@@ -22,7 +22,7 @@ from neural_sim.ranges import validated
 
 OnUntrusted = Literal["shrink", "keep", "skip"]
 Action = Literal["kept", "waited", "taken", "shrunk", "skipped"]
-"""What happens to a step: a trusted one is ``kept``, or ``waited``; the others are for steps that are not trusted."""
+"""The fate of a step: trusted ones are ``kept``, or ``waited``; the other words are for steps that are not trusted."""
 _ACTIONS: Mapping[OnUntrusted, Action] = {"shrink": "shrunk", "keep": "taken", "skip": "skipped"}
 Actions = dict[str, dict[str, Action]]
 """The action on each step, by object and factor. A trusted step ``waited`` if the trust region does not take it yet."""

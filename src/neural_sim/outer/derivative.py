@@ -1,4 +1,4 @@
-"""What a derivative is computed from: losses by row, the path from psi to an image, and a recorded training."""
+"""Inputs of a derivative: losses by row, the path from psi to an image, and a recorded training."""
 
 from __future__ import annotations
 

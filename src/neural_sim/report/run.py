@@ -29,7 +29,7 @@ CALLED = {
     "real_only": "photographs alone",
     "views_only": "the fields' views alone",
 }
-"""What readers are told of the training images of each detector, by its name in files."""
+"""Descriptions of each detector's training images, by the detector's name in files."""
 
 
 @dataclass(frozen=True)

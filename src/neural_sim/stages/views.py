@@ -107,7 +107,7 @@ class Objects(ABC):
 
     source: Source
     has_meshes: ClassVar[bool]
-    """Whether all objects can be rendered without their fields."""
+    """True if every object can be rendered without its field."""
 
     @staticmethod
     def of(source: MeshSource | Photos, views: Views) -> Objects:

@@ -36,7 +36,8 @@ class LabelShift:
             most this fraction of the present psi's. In the psi loop, the object then still takes steps along
             derivatives.
         skill: smallest accuracy on held-out renders, on a scale from 0 (chance) to 1; below it, psi does not move.
-        fewest: smallest number of an object's boxes with which its psi may move.
+        fewest: smallest number of an object's boxes with which its psi may move; boxes of near-duplicate images count
+            as one (``crops.views_of``).
         name: name in reports.
     """
 

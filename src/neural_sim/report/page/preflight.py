@@ -110,7 +110,7 @@ class Preflight:
 
     @property
     def worth(self) -> str:
-        """What the gain equals in labelled photographs, in one or two sentences."""
+        """One or two sentences on how many labelled photographs gain as much."""
         if not self.labelled:
             return (
                 "How many labelled photographs a first step is worth is not known: none are set aside for training "

@@ -37,7 +37,7 @@ LABELS = {"gap": "initial distribution", "target": "bins of the target"}
 
 
 class Panel(NamedTuple):
-    """What one panel of a figure shows.
+    """One panel of a figure.
 
     ``start`` is the initial distribution, empty if that is the axis. ``aim`` is the target, empty if that is the axis
     or the experiment has only one target for the object.

@@ -21,7 +21,7 @@ from neural_sim.studies.experiments.charts import (
 from neural_sim.studies.experiments.results import MEAN, Measured, Setting, called
 
 Shown = tuple[Measured, Mapping[str, Figure]]
-"""What a layout makes of some settings, without commits and costs, and figures by file name."""
+"""A layout's tables of some settings, without commits and costs, and its figures by file name."""
 Layout = Callable[[Sequence[Setting], "Paper | None"], Shown]
 NONE = "none"
 WAYS = {NONE: "synthetic alone", "pretrain": "synthetic, then photographs", "combined": "both together"}

@@ -1,4 +1,4 @@
-"""What the cases share: their inputs and outputs, solids of constant density, and a small detector."""
+"""Parts that all cases share: their inputs and outputs, solids of constant density, and a small detector."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the value and the status are right."""
+        """True if the value and the status are right."""
         return self.value <= self.tolerance and (not self.wanted or self.status in self.wanted)
 
     @property

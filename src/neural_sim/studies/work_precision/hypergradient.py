@@ -90,7 +90,7 @@ class Hypergradients:
 
     @property
     def after_start(self) -> bool:
-        """Whether the loop has to be run."""
+        """True if the loop has to be run first."""
         return any(place != "start" for place in self.places)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
