@@ -38,3 +38,10 @@ def lit(name, distribution, weights):
     maps[:, 12:36, 12:36, :3] = (weights @ HUES).round().to(torch.uint8)[:, None, None]
     maps[:, 12:36, 12:36, 3] = 255
     return PooledSubject(name, maps[None], draw)
+
+
+def moved(images, step):
+    """The images with their boxes, ``step`` pixels further to the right."""
+    boxes = images.boxes.clone()
+    boxes[..., [0, 2]] = (boxes[..., [0, 2]] + step).clamp(0, SIDE)
+    return replace(images, images=images.images.roll(step, 3), boxes=boxes)

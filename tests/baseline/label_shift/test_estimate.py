@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from painted_pools import COLOURS, EACH, SIDE, lit, painted
+from painted_pools import COLOURS, EACH, SIDE, lit, moved, painted
 from torch.nn.functional import avg_pool2d
 
 from neural_sim.baseline.label_shift import reading, renders
-from neural_sim.baseline.label_shift.crops import Augmentation, views_of
+from neural_sim.baseline.label_shift.crops import Augmentation
 from neural_sim.baseline.label_shift.estimate import LabelShift, estimate, trained_reader
 from neural_sim.baseline.label_shift.mixture import Status
 from neural_sim.baseline.label_shift.network import Fitting
@@ -130,35 +130,12 @@ def test_frames_of_a_video_are_no_more_evidence_than_one_of_them(posed, found):
     """Every image five times, moved by a pixel or two: the estimate of the images alone."""
     scene, target, psi = posed
     assert [one.repeated for one in found.factors] == [0, 0]
-    again = LabelledImages.concatenate([target] + [_moved(target, step) for step in (-1, 1, -2, 2)])
+    again = LabelledImages.concatenate([target] + [moved(target, step) for step in (-1, 1, -2, 2)])
     video = read(scene, again, psi)
     assert [(one.boxes, one.repeated) for one in video.factors] == [(40, 160), (40, 160)]
     for one, same in zip(video.factors, found.factors, strict=True):
         assert one.finding == same.finding
         assert float(total_variation(torch.tensor(one.p), torch.tensor(same.p))) < 0.1
-
-
-def _moved(images, step):
-    boxes = images.boxes.clone()
-    boxes[..., [0, 2]] = (boxes[..., [0, 2]] + step).clamp(0, SIDE)
-    return replace(images, images=images.images.roll(step, 3), boxes=boxes)
-
-
-def test_views_are_of_one_object_at_one_place_in_images_that_look_alike(posed):
-    target = posed[1].select(torch.arange(3))
-    twice = LabelledImages.concatenate([target, target])
-    assert views_of(twice, False).tolist() == [0, 1, 2, 0, 1, 2]
-    elsewhere = replace(twice, boxes=twice.boxes.clone())
-    elsewhere.boxes[3] += SIDE / 2
-    assert views_of(elsewhere, False).tolist() == [0, 1, 2, 3, 1, 2]
-    assert views_of(elsewhere, True).tolist() == [0, 1, 2, 0, 1, 2]
-    other = replace(twice, labels=twice.labels.clone())
-    other.labels[4] = 1 - other.labels[4]
-    assert views_of(other, False).tolist() == [0, 1, 2, 0, 4, 2]
-    barred = replace(target, images=target.images.clone())
-    barred.images[:, :, :14] = 0.5
-    barred.images[:, :, -14:] = 0.5
-    assert views_of(barred, True).tolist() == [0, 1, 2]
 
 
 def test_boxes_that_look_like_no_render_move_nothing(posed):

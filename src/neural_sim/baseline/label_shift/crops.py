@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from annotated_types import Ge, Le
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, affine_grid, grid_sample
@@ -26,6 +27,7 @@ MARGIN = 1.5
 """Side of a stored crop, in multiples of the box's longer side. It contains nearly all of a rotated and shifted view;
 beyond it, the crop's border is repeated."""
 _STORED = 44
+_COMPARED = 1024  # boxes that are compared with all others at once, which bounds the memory
 _COVERED = 0.75  # if boxes cover more of an image than this, too little is left around them to compare
 _SHOWN = 1.1  # side of the network's view, in multiples of the box's longer side
 BOX_NUMBERS = 5
@@ -97,31 +99,37 @@ def views_of(images: LabelledImages, whole: bool) -> Int[Tensor, "boxes"]:
     ``whole``, only the label and the image count. All boxes that a chain of such pairs connects show one view. The
     order is that of ``crops_of``.
     """
-    alike = torch.ones(len(images), len(images), dtype=torch.bool)
-    for outside in (False,) if whole else (False, True):
-        thumbnails = torch.stack([_thumbnail(images, row, outside) for row in range(len(images))])
-        alike &= correlation(thumbnails, thumbnails) >= ALIKE
+    looks = torch.stack([_looks(images, row, whole) for row in range(len(images))], 1)
     rows, columns = images.present.nonzero().unbind(1)
     labels, boxes = images.labels[rows, columns], images.boxes[rows, columns]
     views = torch.arange(len(rows))
     for label in labels.unique():
         mine = (labels == label).nonzero()[:, 0]
-        same = alike[rows[mine]][:, rows[mine]]
-        if not whole:
-            same = same & (box_iou(boxes[mine], boxes[mine]) >= 0.5)
-        _, part = connected_components(same.numpy(), directed=False)
+        pairs = []
+        for part in torch.arange(len(mine)).split(_COMPARED):
+            own = mine[part]
+            same = torch.ones(len(own), len(mine), dtype=torch.bool)
+            for look in looks:
+                same &= correlation(look[rows[own]], look[rows[mine]]) >= ALIKE
+            if not whole:
+                same &= box_iou(boxes[own], boxes[mine]) >= 0.5
+            pairs.append(same.nonzero() + part[0] * torch.tensor([1, 0]))
+        one, other = torch.cat(pairs).T.numpy()
+        graph = coo_array((np.ones(len(one), bool), (one, other)), shape=(len(mine), len(mine)))
+        _, part = connected_components(graph, directed=False)
         _, first, inverse = np.unique(part, return_index=True, return_inverse=True)
         views[mine] = mine[torch.from_numpy(first[inverse])]
     return views
 
 
-def _thumbnail(images: LabelledImages, row: int, outside: bool) -> Float[Tensor, "24 24"]:
-    """Return the thumbnail of an image; with ``outside``, its boxes are blanked out unless they cover most of it.
+def _looks(images: LabelledImages, row: int, whole: bool) -> Float[Tensor, "looks 24 24"]:
+    """Return thumbnails of an image and, unless ``whole``, of what is outside its boxes.
 
-    Plain borders are cut off first, because their edges would make all letterboxed photographs look alike.
+    Plain borders are cut off first, because their edges would make all letterboxed photographs look alike. Boxes that
+    cover most of the image are not blanked out.
     """
     image, inside = images.images[row], torch.zeros_like(images.images[row, :1])
-    for box in images.boxes[row, images.present[row]] if outside else ():
+    for box in images.boxes[row, images.present[row]]:
         low, high = box[:2].floor().long().clamp_min(0), box[2:].ceil().long()
         inside[:, low[1] : high[1], low[0] : high[0]] = 1.0
     for axis in (1, 2):
@@ -130,10 +138,13 @@ def _thumbnail(images: LabelledImages, row: int, outside: bool) -> Float[Tensor,
         if len(kept):
             start, length = int(kept[0]), int(kept[-1] - kept[0]) + 1
             image, inside = (each.narrow(3 - axis, start, length) for each in (image, inside))
+    look = thumbnail(image)
+    if whole:
+        return look[None]
     covered = adaptive_avg_pool2d(inside, CELLS)[0] > 0.0
     if covered.float().mean() > _COVERED:
-        covered = torch.zeros_like(covered)
-    return thumbnail(image).masked_fill(covered, 0.0)
+        return torch.stack([look, look])
+    return torch.stack([look, look.masked_fill(covered, 0.0)])
 
 
 @validated
