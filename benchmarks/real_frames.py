@@ -6,6 +6,9 @@ The classifier learns from renders of the fields of all objects in the frames, m
     all sides       rho within 90 degrees, so that every side is in one bin; crops are turned by any angle
     any roll        the same renders, turned by any angle before boxes are drawn; held-out renders are turned as well
     roll known      the renders of `all sides`, crops turned by up to 10 degrees, frames turned by their true roll
+    about the vertical   bins of the turn about the vertical (`axis=azimuth`), cameras held upright, from 30 to 150
+                    degrees from above; crops are turned by up to 10 degrees
+    about the vertical, any roll   the same renders; crops are turned by any angle
 
 A box is right if its most probable bin is the true one or looks the same by symmetry. `--fewest` is the number of boxes
 below which an object is not estimated, 8 by default in runs; boxes of near-duplicate frames count as one. `--width` is
@@ -58,20 +61,23 @@ from neural_sim.target.ycb_video import YcbVideoTarget
 from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages
 
+UPRIGHT = ("parameter.pose.axis=azimuth", "parameter.pose.other_range_deg=[30,150]")
 CASES = {
-    "as configured": (45, 10.0),
-    "all sides": (90, 180.0),
-    "any roll": (90, 180.0),
-    "roll known": (90, 10.0),
+    "as configured": (("unlearned.rho_deg=[-45,45]",), 10.0),
+    "all sides": (("unlearned.rho_deg=[-90,90]",), 180.0),
+    "any roll": (("unlearned.rho_deg=[-90,90]",), 180.0),
+    "roll known": (("unlearned.rho_deg=[-90,90]",), 10.0),
+    "about the vertical": (UPRIGHT, 10.0),
+    "about the vertical, any roll": (UPRIGHT, 180.0),
 }
-"""Largest rho in degrees, and largest turn of the classifier's crops."""
+"""Settings of the renders' poses, and largest turn of the classifier's crops in degrees."""
 
 
-def context_for(options: argparse.Namespace, names: list[str], rho: int) -> Context:
-    """Return the context of the experiment with these objects and this range of rho."""
+def context_for(options: argparse.Namespace, names: list[str], poses: Sequence[str]) -> Context:
+    """Return the context of the experiment with these objects and settings of their poses."""
     overrides = [
         "+experiment=ycb_video_full", "baseline=label_shift", "progress=false", f"seed={options.seed}",
-        f"paths.data={options.shared}", f"objects.names=[{','.join(names)}]", f"unlearned.rho_deg=[-{rho},{rho}]",
+        f"paths.data={options.shared}", f"objects.names=[{','.join(names)}]", *poses,
         "parameter.pose.biased=null", "training.real.mode=none", "target.train_fraction=null",
         f"paths.store={options.out / 'store'}", f"baseline.per_bin={options.per_bin}",
         f"camera.width={options.width}",
@@ -204,11 +210,13 @@ def main() -> None:
     target = YcbVideoTarget(root=options.shared / "ycb_video_sample", every=1)
     frames = list(map(target.reader.frame, target.reader.names))
     names = sorted({item.name for frame in frames for item in frame.objects if item.box is not None})
-    contexts = {rho: context_for(options, names, rho) for rho in {CASES[case][0] for case in options.cases}}
+    contexts = {
+        poses: context_for(options, names, poses) for poses in {CASES[case][0] for case in options.cases}
+    }
     found: dict[str, list[dict[str, Any]]] = {}
     for case in options.cases:
-        rho, turn = CASES[case]
-        began, context = time.process_time(), contexts[rho]
+        poses, turn = CASES[case]
+        began, context = time.process_time(), contexts[poses]
         graph, distribution = context.graph, context.experiment.imaging.distribution
         rendered, generator = context.results(graph.pool), stream(options.seed, "psi")
         generator.set_state(rendered.state)

@@ -160,6 +160,7 @@ class PsiStage(Stage[LearnedPsi]):
         settings = self.outer.first_step
         if isinstance(settings, Derivative):
             return None
+        settings = settings.for_target(self.targets.target.renders)
         return WhatTheTargetShows(settings, groups_of(self.symmetries, results), whole)
 
     @override

@@ -53,7 +53,8 @@ class ShownStage(Stage[Estimate]):
         pool, validation = results(self.pool), results(self.targets).val
         generator = stream(self.seed, "psi")
         generator.set_state(pool.state)
-        found = estimate(pool.scene, validation, self.psi, self.settings, generator, groups, self.whole)
+        settings = self.settings.for_target(self.targets.target.renders)
+        found = estimate(pool.scene, validation, self.psi, settings, generator, groups, self.whole)
         spent = {**found.cpu_seconds, "pool": found.cpu_seconds["pool"] + pool.spent.cpu_seconds}
         return replace(found, seconds=found.seconds + pool.spent.seconds, cpu_seconds=spent)
 

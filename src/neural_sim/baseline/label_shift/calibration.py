@@ -1,9 +1,10 @@
-"""Two guesses of a crop's bins, by the network and by the size of the box alone, and their calibrated posterior.
+"""Guesses of a crop's bins, by a network, by the size of the box alone and by comparison, and their posterior.
 
 A network trained on few renders memorises them: with four bins of distance, it recognised half of the held-out renders,
 while the size of the box alone sufficed to recognise nine in ten. A quadratic logistic regression therefore reads the
-box, and held-out renders determine how much to trust each guess (Wolpert 1992): posteriors are the softmax of
-a_1 z_1 + a_2 z_2 + b, with weights a >= 0 for the logits z of each guess and a bias b for each combination of bins.
+box, templates are compared with it for poses (``comparison``), and held-out renders determine how much to trust each
+guess (Wolpert 1992): posteriors are the softmax of sum_i a_i z_i + b, with weights a_i >= 0 for the logits z_i of each
+guess and a bias b for each combination of bins.
 """
 
 from __future__ import annotations

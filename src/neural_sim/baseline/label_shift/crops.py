@@ -29,7 +29,10 @@ beyond it, the crop's border is repeated."""
 _STORED = 44
 _COMPARED = 1024  # boxes that are compared with all others at once, which bounds the memory
 _COVERED = 0.75  # if boxes cover more of an image than this, too little is left around them to compare
-_SHOWN = 1.1  # side of the network's view, in multiples of the box's longer side
+SHOWN = 1.1
+"""Side of the network's view, in multiples of the box's longer side."""
+RENDERED_ROLL_DEG, ANY_ROLL_DEG = 10.0, 180.0
+"""Largest rotation of crops in the image plane, in degrees: for rendered targets, and for photographs."""
 BOX_NUMBERS = 5
 """How many numbers describe a box."""
 SIZE = (0, 1, 4)
@@ -153,8 +156,8 @@ class Augmentation:
     """Random changes of crops, so that renders cover the variation of photographs.
 
     Args:
-        roll_deg: largest rotation in the image plane, in either direction, in degrees; 180 for cameras held at any
-            roll.
+        roll_deg: largest rotation in the image plane, in either direction, in degrees. Objects are also compared with
+            renders that are rotated by as much. None: 10 for rendered targets, 180 (any roll) for photographs.
         exposure: largest change of brightness, in either direction, in stops; contrast and colour change with it. Not
             used if psi has lights.
         blur: largest fraction of a crop's detail that is lost.
@@ -164,12 +167,17 @@ class Augmentation:
             that describe the box change by up to 1.5 times as much.
     """
 
-    roll_deg: Annotated[float, Ge(0), Le(180)] = 10.0
+    roll_deg: Annotated[float, Ge(0), Le(180)] | None = None
     exposure: NonNegative = 1.0
     blur: Fraction = 0.8
     noise: Fraction = 0.04
     occlusion: Fraction = 0.3
     jitter: Annotated[float, Ge(0), Le(0.5)] = 0.08
+
+    @property
+    def largest_roll_deg(self) -> float:
+        """``roll_deg``; if it is left open, that of rendered targets."""
+        return RENDERED_ROLL_DEG if self.roll_deg is None else self.roll_deg
 
     def __call__(self, crops: Crops, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return the network's view of the crops and the numbers of their boxes, both changed at random."""
@@ -180,7 +188,7 @@ class Augmentation:
 
         zoom, shift = self.jitter * either(), self.jitter * either(2)
         like = like + self.blur * either(1, 1, 1).abs() * (_softened(like) - like)
-        seen = _sampled(like, math.radians(self.roll_deg) * either(), zoom.exp(), shift)
+        seen = _sampled(like, math.radians(self.largest_roll_deg) * either(), zoom.exp(), shift)
         gain = (math.log(2.0) * self.exposure * (either(1, 1, 1) + 0.2 * either(3, 1, 1))).exp()
         mean = seen.mean((2, 3), keepdim=True)
         seen = (mean + (seen - mean) * (0.3 * self.exposure * either(1, 1, 1)).exp()) * gain
@@ -229,7 +237,7 @@ def _sampled(pixels: Tensor, roll: Tensor, zoom: Tensor, shift: Tensor) -> Float
     """Sample the middle of stored crops, rotated, scaled, and shifted by multiples of the box's longer side."""
     if not len(pixels):
         return pixels.new_zeros(0, 3, SIDE, SIDE)
-    scale = _SHOWN / MARGIN * zoom
+    scale = SHOWN / MARGIN * zoom
     cosine, sine = scale * roll.cos(), scale * roll.sin()
     moved = shift / MARGIN
     matrix = torch.stack([cosine, -sine, moved[:, 0], sine, cosine, moved[:, 1]], -1).view(-1, 2, 3)

@@ -3,11 +3,12 @@
     estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
 
 A small classifier of bins (``network``), and another that uses only the size of boxes (``calibration``), are trained on
-renders of all bins, from a pool that is rendered once. Both classify the target's boxes. Expectation maximisation over
-their calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each
-bin; weights of lights come from matching moments (``moments``). A factor of ``Estimate.psi`` moves only if the target
-differs significantly from the present psi, there are enough boxes, these look like renders (``evidence``), the
-classifier recognises renders, and the estimate is precise enough.
+renders of all bins, from a pool that is rendered once. Both classify the target's boxes, and so does a comparison with
+the renders, for poses (``comparison``). Expectation maximisation over their calibrated posterior (``mixture``) gives
+the distribution of every object and factor, with an interval for each bin; weights of lights come from matching moments
+(``moments``). A factor of ``Estimate.psi`` moves only if the target differs significantly from the present psi, there
+are enough boxes, these look like renders (``evidence``), the classifier recognises renders, and the estimate is precise
+enough.
 """
 
 from __future__ import annotations
@@ -122,4 +123,5 @@ def trained_reader(
     clock("network")
     images = validation.to("cpu")
     target, views = crops_of(images, whole), views_of(images, whole)
-    return Reader(settings, distribution, network, training, held, target, views, generator)
+    renders = None if whole else sides[0]  # the place of the object in a whole image is unknown
+    return Reader(settings, distribution, network, renders, training, held, target, views, generator)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.baseline.label_shift.calibration import BoxReader, calibrate
+from neural_sim.baseline.label_shift.comparison import Templates
 from neural_sim.baseline.label_shift.crops import SIZE, Crops, quarters
 from neural_sim.baseline.label_shift.evidence import (
     MOVING,
@@ -26,6 +27,8 @@ from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.parameter.distributions import merged
 from neural_sim.parameter.factor import Factor
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.synthesis.pool import PooledSubject
+from neural_sim.synthesis.scene import Scene
 
 Bins = Sequence[Sequence[int]]
 """Groups of bins, numbered from 1, that look the same."""
@@ -45,6 +48,7 @@ class Reader:
         settings: settings of the estimate.
         distribution: p_psi.
         network: the classifier.
+        renders: renders without background, of which ``training`` is composed; None if whole images are read.
         training: crops on which it was trained.
         held: crops of held-out renders.
         target: crops of the target.
@@ -55,6 +59,7 @@ class Reader:
     settings: LabelShift
     distribution: SceneDistribution
     network: BinNetwork
+    renders: Scene | None
     training: Known
     held: Known
     target: Crops
@@ -90,8 +95,10 @@ class Reader:
             for known in (self.training, self.held)
         )
         mine = self.target.labels == label
+        templates = self._templates(label)
         seen, known = (
-            self._guessed(training, crops, drawn) for crops in (self.target.select(mine), held.crops)
+            self._guessed(training, templates, crops, drawn)
+            for crops in (self.target.select(mine), held.crops)
         )
         limits = None  # stays None if no render shows the object
         if len(training.crops) and len(held.crops):
@@ -100,14 +107,39 @@ class Reader:
         boxes, seen = len(seen), seen.averaged(self.views[mine])
         return _Object(self, name, now, groups, held, known, seen, boxes, limits)
 
-    def _guessed(self, training: Known, crops: Crops, drawn: Bool[Tensor, "cells"]) -> Outputs:
-        """Return the network's outputs, with logits from boxes alone and weights of lights from colours alone added."""
+    def _templates(self, label: int) -> Templates | None:
+        """Return the templates of an object; None without boxes, without a pose, or if no render shows the object."""
+        if self.renders is None or self._poses is None:
+            return None
+        subject = self.renders.subjects[label]
+        assert isinstance(subject, PooledSubject)
+        return Templates.of(subject, self._poses, self.settings.augmentation.largest_roll_deg)
+
+    @property
+    def _poses(self) -> Int[Tensor, "cells"] | None:
+        """Pose of each cell: the combination of its bins of angles; None if psi has none."""
+        factors = self.distribution.binned
+        angles = [factor.coordinate in ("phi", "rho") for factor in factors]
+        if not any(angles):
+            return None
+        cells = Cells(tuple(factor.bins for factor in factors))
+        bins = zip(cells.bins(torch.arange(cells.count)), angles, strict=True)
+        own = torch.stack([chosen for chosen, angle in bins if angle], 1)
+        sizes = tuple(factor.bins for factor, angle in zip(factors, angles, strict=True) if angle)
+        return Cells(sizes).index(own)
+
+    def _guessed(
+        self, training: Known, templates: Templates | None, crops: Crops, drawn: Bool[Tensor, "cells"]
+    ) -> Outputs:
+        """Return the network's outputs, with logits from boxes and templates, and weights of lights from colours."""
         outputs = outputs_of(self.network, crops)
         logits, weights = [outputs.logits], [outputs.weights]
         if self.distribution.binned and len(training.crops):
             cells = Cells(tuple(factor.bins for factor in self.distribution.binned))
             own, others = (each.boxes[:, SIZE] for each in (training.crops, crops))
             logits.append(BoxReader.fitted(own, training.cells, cells)(others))
+        if templates is not None and self._poses is not None:
+            logits.append(templates(crops, int(self._poses.max()) + 1)[:, self._poses])
         if self.distribution.lights:
             own, others = (quarters(each).double() for each in (training.crops, crops))
             weights.append(fitted(own, training.weights.double(), others))

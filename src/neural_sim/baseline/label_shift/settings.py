@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from annotated_types import Ge, Gt, Lt
 
-from neural_sim.baseline.label_shift.crops import Augmentation
+from neural_sim.baseline.label_shift.crops import ANY_ROLL_DEG, Augmentation
 from neural_sim.baseline.label_shift.network import Fitting
 from neural_sim.ranges import Fraction, NonNegative, PositiveFraction, PositiveInt, validated
 
@@ -57,3 +57,9 @@ class LabelShift:
     skill: Fraction = 0.15
     fewest: PositiveInt = 8
     name: str = "label_shift"
+
+    def for_target(self, rendered: bool) -> LabelShift:
+        """Return the settings with what depends on the target: photographs are read at any roll unless it is set."""
+        if rendered or self.augmentation.roll_deg is not None:
+            return self
+        return replace(self, augmentation=replace(self.augmentation, roll_deg=ANY_ROLL_DEG))
