@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from painted_pools import COLOURS, EACH, SIDE, lit, moved, painted
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from neural_sim.baseline.label_shift import reading, renders
 from neural_sim.baseline.label_shift.crops import Augmentation
@@ -155,6 +155,29 @@ def test_boxes_of_other_colours_move_nothing_though_the_classifier_is_sure_of_th
     assert {one.finding for one in result.factors} == {"fits no render"}
     assert min(one.strange for one in result.factors) > 0.7
     torch.testing.assert_close(result.psi, psi.double())
+
+
+def test_photographs_are_compared_with_renders_whatever_their_colour_and_the_size_of_their_boxes(posed):
+    """A yellow light, and boxes a third too large for the object, as if the camera were nearer."""
+    scene, target, psi = posed
+    light, size = torch.tensor([0.9, 0.8, 0.5])[:, None, None], SIDE * 4 // 3
+    near = interpolate(target.images, size=(size, size), mode="bilinear")[..., 8:-8, 8:-8]
+    boxes = ((target.boxes - SIDE / 2) * size / SIDE + SIDE / 2).clamp(0.0, SIDE)
+    lamp, cup = photographed(scene, replace(target, images=light * near, boxes=boxes), psi, strange=1.0)
+    assert lamp.finding == "moves" and cup.finding == "stays"
+    assert float(total_variation(torch.tensor(lamp.p), torch.tensor(P))) < 0.1
+
+
+def test_photographs_that_resemble_no_render_are_refused(posed):
+    scene, target, psi = posed
+    assert [one.finding for one in photographed(scene, target, psi)] == ["moves", "stays"]
+    inverted = photographed(scene, replace(target, images=1.0 - target.images), psi)
+    assert {one.finding for one in inverted} == {"fits no render"}
+
+
+def photographed(scene, target, psi, **more):
+    settings = replace(SETTINGS, photographs=True, augmentation=Augmentation(roll_deg=15.0), **more)
+    return estimate(scene, target, psi, settings, torch.Generator().manual_seed(0)).factors
 
 
 def test_exposure_and_a_little_blur_do_not_matter(posed, found):

@@ -96,6 +96,7 @@ class Reader:
         )
         mine = self.target.labels == label
         templates = self._templates(label)
+        compared = templates is not None and self._compares
         seen, known = (
             self._guessed(training, templates, crops, drawn)
             for crops in (self.target.select(mine), held.crops)
@@ -105,7 +106,13 @@ class Reader:
             features = outputs_of(self.network, training.crops).features
             limits = Strangeness.of(features, training.cells, training.weights.double())
         boxes, seen = len(seen), seen.averaged(self.views[mine])
-        return _Object(self, name, now, groups, held, known, seen, boxes, limits)
+        return _Object(self, name, now, groups, held, known, seen, boxes, limits, compared)
+
+    @property
+    def _compares(self) -> bool:
+        """Whether boxes are only compared with renders: on photographs, if psi has only poses."""
+        angles = all(factor.coordinate in ("phi", "rho") for factor in self.distribution.binned)
+        return bool(self.settings.photographs) and angles and not self.distribution.lights
 
     def _templates(self, label: int) -> Templates | None:
         """Return the templates of an object; None without boxes, without a pose, or if no render shows the object."""
@@ -139,7 +146,8 @@ class Reader:
             own, others = (each.boxes[:, SIZE] for each in (training.crops, crops))
             logits.append(BoxReader.fitted(own, training.cells, cells)(others))
         if templates is not None and self._poses is not None:
-            logits.append(templates(crops, int(self._poses.max()) + 1)[:, self._poses])
+            scores = templates(crops, int(self._poses.max()) + 1)[:, self._poses]
+            logits = [scores] if self._compares else [*logits, scores]
         if self.distribution.lights:
             own, others = (quarters(each).double() for each in (training.crops, crops))
             weights.append(fitted(own, training.weights.double(), others))
@@ -164,7 +172,7 @@ class _Object:
     """One object, with its ``psi`` by factor.
 
     ``known`` are the outputs for its held-out renders (``held``), ``seen`` those for the views that the target's
-    ``boxes`` show.
+    ``boxes`` show. ``compared``: their logits are scores of the comparison with renders alone.
     """
 
     reader: Reader
@@ -176,6 +184,7 @@ class _Object:
     seen: Outputs
     boxes: int
     limits: Strangeness | None
+    compared: bool = False
 
     @property
     def posteriors(self) -> tuple[Float[Tensor, "boxes cells"], Float[Tensor, "held cells"]]:
@@ -201,7 +210,14 @@ class _Object:
     def _strange(
         self, limits: Strangeness, weights: Float[Tensor, "lights"], frequency: Float[Tensor, "held"]
     ) -> float:
-        """Compare the boxes with held-out renders by features or, if psi has lights only, by guesses of the weights."""
+        """Compare the boxes with held-out renders.
+
+        They are compared by the network's features; if psi has lights only, by guesses of their weights; and if logits
+        are scores of a comparison, by the best score.
+        """
+        if self.compared:
+            seen, known = (-each.logits[0].amax(-1) for each in (self.seen, self.known))
+            return part_farther(seen, known, frequency)
         lights = [f for f in self.reader.distribution.factors if f not in self.reader.distribution.binned]
         if len(lights) == len(self.reader.distribution.factors):
             response = Response.of(self.known.weights, self.held.weights.double())

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Lt
 
-from neural_sim.baseline.label_shift.crops import ANY_ROLL_DEG, Augmentation
+from neural_sim.baseline.label_shift.crops import ANY_ROLL_DEG, RENDERED_ROLL_DEG, Augmentation
 from neural_sim.baseline.label_shift.network import Fitting
 from neural_sim.ranges import Fraction, NonNegative, PositiveFraction, PositiveInt, validated
 
@@ -38,6 +38,9 @@ class LabelShift:
         skill: smallest accuracy on held-out renders, on a scale from 0 (chance) to 1; below it, psi does not move.
         fewest: smallest number of an object's boxes with which its psi may move; boxes of near-duplicate images count
             as one (``crops.views_of``).
+        photographs: whether to expect images that differ from renders in more than psi: boxes are read at any roll,
+            unless ``augmentation.roll_deg`` is set, and poses by comparison with the renders alone, because the
+            network and the sizes of boxes mislead there. None: for targets of photographs.
         name: name in reports.
     """
 
@@ -56,10 +59,16 @@ class LabelShift:
     nearer: Fraction = 0.5
     skill: Fraction = 0.15
     fewest: PositiveInt = 8
+    photographs: bool | None = None
     name: str = "label_shift"
 
     def for_target(self, rendered: bool) -> LabelShift:
-        """Return the settings with what depends on the target: photographs are read at any roll unless it is set."""
-        if rendered or self.augmentation.roll_deg is not None:
-            return self
-        return replace(self, augmentation=replace(self.augmentation, roll_deg=ANY_ROLL_DEG))
+        """Return the settings with those chosen that depend on whether the target is rendered."""
+        photographs, roll_deg = self.photographs, self.augmentation.roll_deg
+        if photographs is None:
+            photographs = not rendered
+        if roll_deg is None:
+            roll_deg = ANY_ROLL_DEG if photographs else RENDERED_ROLL_DEG
+        return replace(
+            self, photographs=photographs, augmentation=replace(self.augmentation, roll_deg=roll_deg)
+        )
