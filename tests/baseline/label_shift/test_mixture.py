@@ -9,6 +9,7 @@ from scipy.optimize import minimize
 from scipy.stats import beta, binom
 
 from neural_sim.baseline.label_shift.mixture import (
+    MORE,
     Cells,
     Status,
     grouped,
@@ -139,7 +140,21 @@ def test_the_test_of_one_factor_leaves_the_others_free():
     boxes = sure[[0] * 10 + [2] * 10]  # the first factor is balanced, the second always in its bin 1
     even = torch.tensor([0.5, 0.5], dtype=torch.float64)
     assert ratio_test(boxes, cells, {0: even}, known, 0.3, 99, seed) > 0.3
-    assert ratio_test(boxes, cells, {1: even}, known, 0.3, 99, seed) == pytest.approx(0.01)
+    assert ratio_test(boxes, cells, {1: even}, known, 0.3, 99, seed) == pytest.approx(1 / (MORE * 100))
+
+
+def test_a_ratio_that_no_sample_reaches_gets_more_samples_and_leaves_the_generator_as_any_other():
+    """19 in 20, with an exact p-value of 4e-5: the smallest that five times as many samples can have."""
+    sure, even = torch.eye(2, dtype=torch.float64), torch.tensor([0.5, 0.5], dtype=torch.float64)
+    known = sure.repeat(10, 1), torch.arange(2).repeat(10)
+    states = []
+    for successes, smallest in ((19, 1 / 1000), (11, 0.3)):
+        boxes = sure[[0] * successes + [1] * (20 - successes)]
+        generator = torch.Generator().manual_seed(1)
+        found = ratio_test(boxes, Cells((2,)), {0: even}, known, 0.3, 199, generator)
+        assert found == pytest.approx(smallest) if successes == 19 else found > smallest
+        states.append(generator.get_state())
+    assert torch.equal(*states)
 
 
 def test_known_boxes_stand_for_the_null_however_many_of_them_each_cell_has():

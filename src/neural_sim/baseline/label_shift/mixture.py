@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+MORE = 5
+"""Factor on the number of samples of a test that none of them reaches."""
 Probabilities = tuple[Float[Tensor, "*batch _"], ...]
 """The probabilities of every factor's bins."""
 
@@ -213,7 +215,9 @@ def ratio_test(
 
     The statistic is twice the logarithm of the likelihood ratio. Its null distribution comes from samples of the
     ``known`` boxes, on which the classifier errs as it does on the target's. Each sample has as many boxes as the
-    target, with cells drawn from the null (for other factors, from the best fit under it).
+    target, with cells drawn from the null (for other factors, from the best fit under it). If no sample reaches the
+    target's statistic, there are ``MORE`` times as many, because a training's verdict is weighed against the p-value
+    (``outer.trust_region``): one in 200 says too little of a ratio far beyond all samples.
 
     Args:
         likelihood: likelihood of each box in every cell.
@@ -221,16 +225,27 @@ def ratio_test(
         null: the tested distributions, by the position of their factor.
         known: likelihoods of boxes of known cells, and these cells; every cell has at least one box.
         prior: see ``maximise``.
-        draws: number of bootstrap draws; the smallest p-value is 1 / (``draws`` + 1).
+        draws: number of samples; the smallest p-value is 1 / (``MORE`` (``draws`` + 1)).
         generator: the source of all random numbers.
     """
     observed, under = _statistic(likelihood[None], cells, null, prior)
     joint = cells.joint(tuple(own[0] for own in under))
     known_likelihood, known_cells = known
     weights = joint[known_cells] / torch.bincount(known_cells, minlength=cells.count)[known_cells]
-    rows = torch.multinomial(weights, draws * len(likelihood), replacement=True, generator=generator)
-    drawn, _ = _statistic(known_likelihood[rows].view(draws, *likelihood.shape), cells, null, prior)
-    return (1 + int((drawn >= observed).sum())) / (draws + 1)
+
+    def reaching(count: int, source: torch.Generator) -> int:
+        rows = torch.multinomial(weights, count * len(likelihood), replacement=True, generator=source)
+        drawn, _ = _statistic(known_likelihood[rows].view(count, *likelihood.shape), cells, null, prior)
+        return int((drawn >= observed).sum())
+
+    if reached := reaching(draws, generator):
+        return (1 + reached) / (draws + 1)
+    apart = torch.Generator().manual_seed(
+        generator.initial_seed()
+    )  # so that later draws do not depend on the data
+    apart.set_state(generator.get_state())
+    every = MORE * (draws + 1) - 1
+    return (1 + reaching(every - draws, apart)) / (every + 1)
 
 
 def _statistic(
