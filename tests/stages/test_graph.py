@@ -12,6 +12,7 @@ from PIL import Image
 
 from neural_sim.baseline.label_shift.estimate import Estimate
 from neural_sim.main import build
+from neural_sim.outer.first_step import WhatTheTargetShows
 from neural_sim.outer.inner import RenderedPool
 from neural_sim.outer.records import Cost, LearnedPsi
 from neural_sim.stages import shown
@@ -87,6 +88,29 @@ def test_an_estimate_is_charged_for_the_renders_that_it_reads(tmp_path, monkeypa
     monkeypatch.setattr(shown, "estimate", lambda *arguments: found)
     made = stage.make(cast(Any, lambda wanted: pool if wanted is stage.pool else Mock()))
     assert made.seconds == 11.0 and made.cpu_seconds == {"pool": 8.5, "images": 1.0}
+
+
+@pytest.mark.parametrize("renders", [True, False])
+def test_photographs_are_read_as_such_by_the_method_and_by_the_loop_s_first_step(
+    tmp_path, monkeypatch, renders
+):
+    graph = Graph(build(composed("+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}")))
+    targets = replace(graph.targets, target=Mock(renders=renders))
+    pool, settings = RenderedPool(cast(Any, None), torch.Generator().get_state(), Cost()), []
+
+    def estimated(scene, images, psi, chosen, *rest):
+        settings.append(chosen)
+        return Estimate((), psi, 5, 2.0, {"pool": 0.5})
+
+    monkeypatch.setattr(shown, "estimate", estimated)
+    stage = replace(graph.shown, symmetries=(), targets=targets)
+    stage.make(cast(Any, lambda wanted: pool if wanted is stage.pool else Mock()))
+    loop = replace(graph.learned, symmetries=(), targets=targets)
+    first = loop._first_step(cast(Any, Mock()), False)
+    assert isinstance(first, WhatTheTargetShows)
+    for chosen in (settings[0], first.settings):
+        assert chosen.photographs is not renders
+        assert chosen.augmentation.roll_deg == (10.0 if renders else 180.0)
 
 
 def test_a_first_hypergradient_at_a_warm_start_of_other_images_is_refused():
