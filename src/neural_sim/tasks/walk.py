@@ -179,15 +179,15 @@ def warn_of_uncovered(graph: Graph) -> None:
 
 
 def warn_of_misreading(graph: Graph) -> None:
-    """Warn where psi is estimated from photographs: those whose bins are known were mostly misread."""
+    """Warn where psi is estimated from photographs: of those whose bins are known, at most half were read right."""
     method, outer = graph.experiment.loop.method, graph.experiment.loop.outer
     alone = isinstance(method, LabelShift)
     first = isinstance(method, HypergradientLoop) and isinstance(outer.first_step, LabelShift)
     if graph.renders_target or not (alone or first):
         return
     _log.warning(
-        "what your photographs show is estimated, and may be wrong: where the bins were known, photographs were mostly "
-        "misread (docs/results.md, On real frames); %s",
+        "what your photographs show is estimated, and may be wrong: where the bins were known, a third to half of the "
+        "boxes were read right (docs/results.md, On real frames); %s",
         f"no training judges the estimate with baseline={method.name}, baseline=neural_sim does" if alone
         else "a training judges the estimate; compare its scores with those before",
     )  # fmt: skip
