@@ -6,6 +6,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
+from neural_sim.baseline.label_shift import calibration
 from neural_sim.baseline.label_shift.calibration import BoxReader, calibrate
 from neural_sim.baseline.label_shift.mixture import Cells
 
@@ -101,3 +102,24 @@ def test_weights_and_biases_are_the_minimum_that_a_direct_search_finds(repeated)
     best = minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-8}).x
     np.testing.assert_allclose(found.weights.flatten(), np.exp(best[:2]), atol=1e-3)
     np.testing.assert_allclose(found.bias.flatten(), best[2:] - best[2:].mean(), atol=1e-3)
+
+
+def test_a_search_that_diverges_is_repeated_within_bounds(monkeypatch):
+    """A search over twenty bootstrap samples took a step to infinity on pose_gap, seed 103."""
+    generator = torch.Generator().manual_seed(0)
+    cells = torch.randint(3, (30,), generator=generator)
+    right = torch.eye(3, dtype=torch.float64)[cells]
+    guesses = torch.stack([right, 2.0 * right]) + torch.randn(2, 30, 3, generator=generator).double()
+    found = calibrate(guesses, cells)
+
+    def diverged(variables, loss):
+        for variable in variables:
+            variable.data.fill_(torch.inf)
+
+    monkeypatch.setattr(calibration, "_minimised", diverged)
+    again = calibrate(guesses, cells)
+    torch.testing.assert_close(again(guesses), found(guesses), atol=1e-3, rtol=0.0)
+    certain = calibrate(100.0 * right[None], cells)
+    assert (
+        bool(certain.weights.isfinite().all()) and float(certain(100.0 * right[None]).amax(-1).min()) > 0.99
+    )

@@ -9,15 +9,21 @@ guess and a bias b for each combination of bins.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from scipy.optimize import minimize
+from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
 from neural_sim.baseline.label_shift.mixture import Cells
+
+LARGEST = 10.0
+"""Largest bias, and largest logarithm of a weight, where the search for them without bounds diverges."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +128,13 @@ def calibrate(
         right = found.gather(-1, cells.expand(len(counts), -1)[..., None])[..., 0]
         return ridge * bias.square().sum() - (counts * right).sum()
 
+    start = float(loss().detach())
     _minimised([log_weights, bias], loss)
+    if not float(loss().detach()) <= start:  # a line search may step so far that nothing is finite any more
+        with torch.no_grad():
+            log_weights.fill_(-math.log(len(guesses)))
+            bias.zero_()
+        _minimised_within([log_weights, bias], loss, LARGEST)
     return Calibration(log_weights.detach().exp(), bias.detach() - bias.detach().mean(-1, keepdim=True))
 
 
@@ -138,3 +150,21 @@ def _minimised(variables: Sequence[Tensor], loss: Callable[[], Tensor]) -> list[
 
     optimiser.step(closure)
     return [variable.detach() for variable in variables]
+
+
+def _minimised_within(variables: Sequence[Tensor], loss: Callable[[], Tensor], largest: float) -> None:
+    """Minimise a smooth loss as ``_minimised`` does, but more slowly, with no variable beyond +- ``largest``."""
+
+    def placed(values: np.ndarray) -> None:
+        with torch.no_grad():
+            nn.utils.vector_to_parameters(torch.from_numpy(values), variables)
+
+    def evaluated(values: np.ndarray) -> tuple[float, np.ndarray]:
+        placed(values)
+        value = loss()
+        slopes = torch.autograd.grad(value, variables)
+        return float(value.detach()), torch.cat([slope.flatten() for slope in slopes]).numpy()
+
+    start = torch.cat([variable.detach().flatten() for variable in variables]).numpy()
+    bounds = [(-largest, largest)] * len(start)
+    placed(minimize(evaluated, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 500}).x)
