@@ -60,7 +60,7 @@ STUDY = Temperatures((1e-4,), rounds=2, truth_per_bin=4, draws=100)
 
 
 def test_a_derivative_of_zero_is_refused_in_words(loop):
-    """As after a solve that found no v: no error is relative to it."""
+    """If a solve found no v, there is nothing for an error to be relative to."""
     still = replace(loop, vector={name: torch.zeros_like(value) for name, value in loop.vector.items()})
     with pytest.raises(ValueError, match=r"temperatures: the derivative of a, b is 0.*adjoint solve: "):
         STUDY.measure(still, PathwiseEstimator(), 4, seed=0)

@@ -67,7 +67,7 @@ def test_a_turned_crop_resembles_its_bin_as_much_as_any_that_a_turn_makes_the_sa
 
 
 def test_templates_are_cut_out_as_the_network_sees_their_boxes(subject):
-    """Where the object covers the crop, render and crop have the same pixels."""
+    """A render and a crop of it have the same pixels wherever the object covers both."""
     crops = crops_of(shown(subject), False)
     seen = plain(crops)[0] + 0.5
     for row in range(BINS):

@@ -119,8 +119,8 @@ def views_of(images: LabelledImages, whole: bool) -> Int[Tensor, "boxes"]:
             pairs.append(same.nonzero() + part[0] * torch.tensor([1, 0]))
         one, other = torch.cat(pairs).T.numpy()
         graph = coo_array((np.ones(len(one), bool), (one, other)), shape=(len(mine), len(mine)))
-        _, part = connected_components(graph, directed=False)
-        _, first, inverse = np.unique(part, return_index=True, return_inverse=True)
+        _, component = connected_components(graph, directed=False)
+        _, first, inverse = np.unique(component, return_index=True, return_inverse=True)
         views[mine] = mine[torch.from_numpy(first[inverse])]
     return views
 

@@ -240,10 +240,7 @@ def ratio_test(
 
     if reached := reaching(draws, generator):
         return (1 + reached) / (draws + 1)
-    apart = torch.Generator().manual_seed(
-        generator.initial_seed()
-    )  # so that later draws do not depend on the data
-    apart.set_state(generator.get_state())
+    apart = generator.clone_state()  # so that later draws do not depend on the data
     every = MORE * (draws + 1) - 1
     return (1 + reaching(every - draws, apart)) / (every + 1)
 

@@ -110,7 +110,7 @@ class Reader:
 
     @property
     def _compares(self) -> bool:
-        """Whether boxes are only compared with renders: on photographs, if psi has only poses."""
+        """True on photographs if psi has only poses: boxes are compared with renders, and nothing else reads them."""
         angles = all(factor.coordinate in ("phi", "rho") for factor in self.distribution.binned)
         return bool(self.settings.photographs) and angles and not self.distribution.lights
 
@@ -145,8 +145,9 @@ class Reader:
             cells = Cells(tuple(factor.bins for factor in self.distribution.binned))
             own, others = (each.boxes[:, SIZE] for each in (training.crops, crops))
             logits.append(BoxReader.fitted(own, training.cells, cells)(others))
-        if templates is not None and self._poses is not None:
-            scores = templates(crops, int(self._poses.max()) + 1)[:, self._poses]
+        poses = self._poses
+        if templates is not None and poses is not None:
+            scores = templates(crops, int(poses.max()) + 1)[:, poses]
             logits = [scores] if self._compares else [*logits, scores]
         if self.distribution.lights:
             own, others = (quarters(each).double() for each in (training.crops, crops))
