@@ -131,6 +131,25 @@ def test_ctrl_c_ends_in_the_ordinary_way_what_it_is_meant_to_end():
     assert _end(process, signal.SIGINT) == (0, "ended\n", [])
 
 
+def test_ctrl_c_that_is_read_late_is_told_by_where_it_came_and_the_next_one_still_ends():
+    code = (
+        "import os, time\nfrom neural_sim import interruption\nread = os.read\n"
+        "def late(*arguments):\n    byte = read(*arguments)\n    time.sleep(0.2 * (byte == b'\\x02'))\n"
+        "    return byte\n"
+        "interruption.os.read = late\n"
+        "with interruption.interruptible():\n    try:\n        with interruption.ctrl_c_as_exception():\n"
+        "            print('begun', flush=True)\n            time.sleep(60)\n"
+        "    except KeyboardInterrupt:\n        time.sleep(0.5)\n        print('ended', flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    process = _begin([sys.executable, "-c", code])
+    assert process.stdout.readline() == "begun\n"
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == "ended\n"
+    time.sleep(2.0)  # the first one, had it been taken for an end, would have ended the process by now
+    assert process.poll() is None and _end(process, signal.SIGINT) == (130, "", [LINE.format("SIGINT")])
+
+
 def _command(folder, *arguments):
     paths = [f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db"]
     return _begin([sys.executable, "-m", "src.main", *arguments, *paths])

@@ -27,6 +27,10 @@ LIMIT = 1.7
 """Seconds after which the process is ended."""
 _LINE = "neural-sim: ended by {}; the same command resumes from the results in the store\n"
 _last_acts: list[Callable[[Interrupted], object]] = []
+_wakeup: int | None = None
+"""Where signals are written for the second thread, in their order; None outside ``interruptible``."""
+# What else is written there, in bytes that are no signal's number.
+_CLOSED, _CTRL_C_TAKEN, _CTRL_C_BACK, _RAISED = 0, 100, 101, 128
 
 
 class Interrupted(SystemExit):
@@ -58,9 +62,11 @@ def interruptible() -> Iterator[None]:
 
     A signal that was ignored when the process started stays ignored, such as Ctrl-C in background jobs of a shell.
     """
+    global _wakeup
     ending = _Ending()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
+    _wakeup = writing
     thread = threading.Thread(target=ending.watch, args=(reading,), daemon=True, name="interruption")
     thread.start()
     wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
@@ -77,7 +83,8 @@ def interruptible() -> Iterator[None]:
         for signum, handler in before.items():
             signal.signal(signum, handler)
         signal.set_wakeup_fd(wakeup)
-        os.write(writing, b"\0")
+        _wakeup = None
+        os.write(writing, bytes([_CLOSED]))
         thread.join()
         os.close(reading)
         os.close(writing)
@@ -106,11 +113,14 @@ def ctrl_c_as_exception() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    # The second thread may read a signal late, so the pipe's order says which ones came in this context.
+    _write(_CTRL_C_TAKEN)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+        _write(_CTRL_C_BACK)
 
 
 def this_process() -> str:
@@ -163,15 +173,19 @@ class _Ending:
         """Raise in the main thread. As a signal handler, it runs as soon as that thread executes Python code."""
         if self.error is None:
             self.error = Interrupted(signum)
+            _write(_RAISED + signum)
             raise self.error
 
     def watch(self, descriptor: int) -> None:
         """Wait for the first signal, report it, and end the process if it has not ended in time."""
-        signum = 0
-        while signum not in SIGNALS or signal.getsignal(signum) is signal.default_int_handler:
+        signum, taken = 0, 0
+        while signum not in SIGNALS or (signum == signal.SIGINT and taken):
             signum = os.read(descriptor, 1)[0]
-            if signum == 0:
+            if signum == _CLOSED:
                 return
+            taken += (signum == _CTRL_C_TAKEN) - (signum == _CTRL_C_BACK)
+            if signum > _RAISED:
+                signum, taken = signum - _RAISED, 0
         error = Interrupted(signum)
         with suppress(OSError):
             os.write(2, _LINE.format(error).encode())
@@ -181,6 +195,12 @@ class _Ending:
         acts.start()
         acts.join(LIMIT - UNWINDING)
         os._exit(error.status)
+
+
+def _write(byte: int) -> None:
+    if _wakeup is not None:
+        with suppress(BlockingIOError):
+            os.write(_wakeup, bytes([byte]))
 
 
 def _do_last_acts(error: Interrupted) -> None:
