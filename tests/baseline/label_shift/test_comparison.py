@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from painted_pools import EACH, SIDE, painted
+from scipy.ndimage import minimum_filter
 
 from neural_sim.baseline.label_shift.comparison import SLOPES, Templates, _turned, rolls_of
 from neural_sim.baseline.label_shift.crops import crops_of, plain
@@ -77,8 +78,16 @@ def test_templates_are_cut_out_as_the_network_sees_their_boxes(subject):
         assert float(aspect) == pytest.approx(float(crops.boxes[row, 0] - crops.boxes[row, 1]), abs=1e-5)
 
 
+def directions(grey):
+    """Directions of numpy's gradients, shorter than 1 where there is little slope, and the lengths of the slopes."""
+    slopes = 2.0 * np.stack(np.gradient(grey, axis=(1, 0)))
+    slopes[0][:, [0, -1]] = slopes[1][[0, -1]] = 0.0
+    length = np.linalg.norm(slopes, axis=0)
+    return slopes / (length + 0.02), length
+
+
 def test_the_score_is_the_sum_of_its_three_parts(subject):
-    """Colours against numpy's correlation over the object; slopes of an exact copy agree fully, aspects differ by 0."""
+    """Colours against numpy's correlation over the object, slopes against its gradients, and the sides by hand."""
     crops = crops_of(shown(subject), False).select(torch.tensor([1]))
     templates = Templates.of(replace(subject, maps=subject.maps[:, :1]), torch.arange(BINS), 0.0)
     first = torch.tensor([1])
@@ -93,7 +102,13 @@ def test_the_score_is_the_sum_of_its_three_parts(subject):
     whole = float(templates._scored(seen32, crops.boxes, first))
     without = replace(templates, slopes=torch.zeros_like(templates.slopes))
     assert float(without._scored(seen32, crops.boxes, first)) == pytest.approx(expected, abs=1e-4)
-    assert 0.5 * SLOPES < whole - expected <= SLOPES
+    (there, _), (here, lengths) = (
+        directions(each.reshape(3, 32, 32).mean(0))
+        for each in (seen32[0].numpy(), cut[:3] / cut[3:].clip(1e-3))
+    )
+    eroded = minimum_filter(templates.opacity[1].numpy().reshape(32, 32), 3, mode="constant", cval=1.0)
+    agreement = np.average((there * here).sum(0), weights=eroded * lengths / (lengths + 0.04))
+    assert whole - expected == pytest.approx(SLOPES * agreement, abs=1e-4) and agreement > 0.5
     wider = crops.boxes + torch.tensor([0.3, 0.0, 0.0, 0.0, 0.0])
     assert whole - float(templates._scored(seen32, wider, first)) == pytest.approx(0.3, abs=1e-5)
     cut_off = wider + torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0])

@@ -4,11 +4,11 @@
 
 A small classifier of bins (``network``), and another that uses only the size of boxes (``calibration``), are trained on
 renders of all bins, from a pool that is rendered once. Both classify the target's boxes, and so does a comparison with
-the renders, for poses (``comparison``). Expectation maximisation over their calibrated posterior (``mixture``) gives
-the distribution of every object and factor, with an interval for each bin; weights of lights come from matching moments
-(``moments``). A factor of ``Estimate.psi`` moves only if the target differs significantly from the present psi, there
-are enough boxes, these look like renders (``evidence``), the classifier recognises renders, and the estimate is precise
-enough.
+the renders, for poses (``comparison``), which alone reads the poses of photographs. Expectation maximisation over their
+calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each bin;
+weights of lights come from matching moments (``moments``). A factor of ``Estimate.psi`` moves only if the target
+differs significantly from the present psi, there are enough boxes, these look like renders (``evidence``), the
+classifier recognises renders, and the estimate is precise enough.
 """
 
 from __future__ import annotations
@@ -119,9 +119,11 @@ def trained_reader(
     augmentation = settings.augmentation
     if distribution.lights:  # random exposures would hide the light, which is to be estimated
         augmentation = replace(augmentation, exposure=0.0)
-    settings.fitting(training, network, augmentation, generator)
-    clock("network")
     images = validation.to("cpu")
     target, views = crops_of(images, whole), views_of(images, whole)
     renders = None if whole else sides[0]  # the place of the object in a whole image is unknown
-    return Reader(settings, distribution, network, renders, training, held, target, views, generator)
+    reader = Reader(settings, distribution, network, renders, training, held, target, views, generator)
+    if not reader.compares:
+        settings.fitting(training, network, augmentation, generator)
+    clock("network")
+    return reader

@@ -47,7 +47,7 @@ class Reader:
     Attributes:
         settings: settings of the estimate.
         distribution: p_psi.
-        network: the classifier.
+        network: the classifier; untrained if the reader ``compares``.
         renders: renders without background, of which ``training`` is composed; None if whole images are read.
         training: crops on which it was trained.
         held: crops of held-out renders.
@@ -96,7 +96,7 @@ class Reader:
         )
         mine = self.target.labels == label
         templates = self._templates(label)
-        compared = templates is not None and self._compares
+        compared = templates is not None and self.compares
         seen, known = (
             self._guessed(training, templates, crops, drawn)
             for crops in (self.target.select(mine), held.crops)
@@ -109,10 +109,11 @@ class Reader:
         return _Object(self, name, now, groups, held, known, seen, boxes, limits, compared)
 
     @property
-    def _compares(self) -> bool:
+    def compares(self) -> bool:
         """True on photographs if psi has only poses: boxes are compared with renders, and nothing else reads them."""
         angles = all(factor.coordinate in ("phi", "rho") for factor in self.distribution.binned)
-        return bool(self.settings.photographs) and angles and not self.distribution.lights
+        poses = angles and not self.distribution.lights
+        return bool(self.settings.photographs) and poses and self.renders is not None
 
     def _templates(self, label: int) -> Templates | None:
         """Return the templates of an object; None without boxes, without a pose, or if no render shows the object."""
@@ -148,7 +149,7 @@ class Reader:
         poses = self._poses
         if templates is not None and poses is not None:
             scores = templates(crops, int(poses.max()) + 1)[:, poses]
-            logits = [scores] if self._compares else [*logits, scores]
+            logits = [scores] if self.compares else [*logits, scores]
         if self.distribution.lights:
             own, others = (quarters(each).double() for each in (training.crops, crops))
             weights.append(fitted(own, training.weights.double(), others))
