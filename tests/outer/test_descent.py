@@ -261,14 +261,37 @@ def test_a_first_step_shares_no_random_numbers_with_the_trainings_that_judge_it(
     assert taken and len(first.seeds) == 1 and first.seeds[0] not in taken
 
 
-def test_a_first_step_that_finds_nothing_costs_no_training(scene):
+@pytest.mark.parametrize("psi", [torch.zeros(2, 4), THERE], ids=["uniform", "biased"])
+def test_a_first_step_that_finds_nothing_costs_no_training(scene, monkeypatch, psi):
+    """From a biased start, the training shows whether objects are found at all; then it is differentiated."""
+    monkeypatch.setattr(Trained, "unseen", torch.tensor([False, True]))
     unsure = (replace(SHOWN[0], finding="uncertain"),)
-    first = Fake(torch.zeros(2, 4), shown=unsure)
-    plain, module = (checked_loop(scene, 2, **more) for more in ({}, {"first": first}))
+    first = Fake(psi.double(), shown=unsure)
+    plain, module = (checked_loop(scene, 2, psi=psi.double(), **more) for more in ({}, {"first": first}))
     one, other = (learn_psi(loop) for loop in (plain, module))
     assert [r.detector_steps for r in one.records] == [r.detector_steps for r in other.records]
     assert other.records[0].verdicts == {} and other.shown == unsure
     assert torch.equal(one.last, other.last)
+
+
+@pytest.mark.parametrize("finds", [False, True])
+def test_an_object_that_is_neither_read_nor_found_is_guessed_and_then_takes_steps(
+    scene, monkeypatch, caplog, finds
+):
+    caplog.set_level("INFO")
+    unread = (replace(SHOWN[0], finding="not told apart"), replace(SHOWN[0], name="b", finding="stays"))
+    module = checked_loop(scene, 3, first=Fake(THERE.double(), shown=unread), psi=THERE.double())
+    monkeypatch.setattr(Trained, "unseen", torch.tensor([not finds, True]))
+    scored_by(monkeypatch, lambda psi: -psi.abs().amax(1))
+    learned = learn_psi(module)
+    tried = learned.records[0].verdicts
+    assert ("the detector does not find the a" in caplog.text) == (not finds)
+    if finds:
+        assert not tried and torch.equal(learned.trajectory[0], THERE.double())
+    else:
+        assert set(tried) == {"a"} and tried["a"].accepted
+        assert set(learned.records[0].certificate.actions) == {"a"}
+        assert torch.equal(learned.last[1], THERE[1].double()) and float(learned.last[0].abs().max()) < 3.0
 
 
 @pytest.mark.parametrize("right", [True, False])

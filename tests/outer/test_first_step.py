@@ -1,6 +1,7 @@
 """The first step that the target's boxes propose: which objects move, on what evidence, by whose renders."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,8 +11,12 @@ from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.baseline.label_shift.network import Fitting
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import StratifiedEstimator
-from neural_sim.outer.first_step import WhatTheTargetShows, p_value_of
+from neural_sim.outer.first_step import WhatTheTargetShows, p_value_of, with_guesses
 from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.steps import Proposal
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions
+from neural_sim.parameter.illumination import Illumination
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.scene import Scene
 
 QUICK = LabelShift(per_bin=8, compositions=2, fitting=Fitting(epochs=8), draws=19, fewest=1, strange=1.0)
@@ -30,6 +35,49 @@ def test_several_factors_that_move_pay_for_their_number():
     )  # fmt: skip
     found = [p_value_of(factors, name) for name in "abcde"]
     assert found == pytest.approx([0.02, 0.01, 1.0, 1.0, 1.0])
+
+
+def test_what_is_neither_read_nor_found_is_spread_over_all_bins_that_are_open():
+    closed = ConfiguredDistributions(closed={"c": (4,)})
+    factors = (
+        BinnedFactor("pose", "phi", 4, 0.0, 1.0, configured=closed),
+        BinnedFactor("zoom", "distance", 2, 1.0, 2.0),
+    )
+    scene = SimpleNamespace(names=tuple("abcd"), distribution=SceneDistribution(factors))
+    psi = torch.tensor([[4.0, 0.0, 0.0, 0.0, 2.0, 0.0]]).repeat(4, 1).double()
+    psi[2, 3] = -torch.inf
+    psi[3, :4] = torch.tensor([0.05, 0.0, 0.0, 0.0])
+    shown = (
+        estimate("a", "pose", 0.9, "not told apart"), estimate("a", "zoom", 0.9, "stays"),
+        estimate("b", "pose", 0.9, "uncertain"), estimate("b", "zoom", 0.01, "moves"),
+        estimate("c", "pose", 1.0, "fits no render"), estimate("c", "zoom", 1.0, "too few boxes"),
+        estimate("d", "pose", 1.0, "uncertain"), estimate("d", "zoom", 0.9, "stays"),
+    )  # fmt: skip
+    proposal = Proposal(psi, torch.tensor([1.0, 0.01, 1.0, 1.0]), 7, shown)
+    found, spread = with_guesses(proposal, set("abcd"), scene)
+    # b moves along zoom, which may be all that it lacks; d is nearly uniform.
+    assert spread == (("a", "pose"), ("c", "pose"), ("c", "zoom"))
+    p = scene.distribution.probabilities(found.psi)
+    assert p["pose"][0].tolist() == pytest.approx([0.25] * 4)
+    assert p["pose"][2].tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0.0])
+    assert p["zoom"][2].tolist() == pytest.approx([0.5, 0.5])
+    assert torch.equal(found.psi[[1, 3]], psi[[1, 3]]) and torch.equal(found.psi[0, 4:], psi[0, 4:])
+    assert found.p_values.tolist() == pytest.approx([0.5, 0.01, 0.5, 1.0])
+    assert found.images == 7 and found.shown == shown and float(psi[0, 0]) == 4.0
+    assert with_guesses(proposal, {"b"}, scene)[1] == ()
+
+
+def test_a_light_that_is_neither_read_nor_found_is_guessed_because_none_covers_the_others():
+    light = Illumination(anchors=3)
+    scene = SimpleNamespace(names=("a", "b"), distribution=SceneDistribution((light,)))
+    psi = torch.tensor([[1.0, 0.0, 0.0], [0.1, 0.3, 0.6]]).double()
+    guess = estimate("a", "illumination", 0.9, "uncertain")
+    guess = replace(guess, p=(0.1, 0.3, 0.6), lights=True)
+    found, guessed = with_guesses(
+        Proposal(psi, torch.ones(2), 0, (guess, replace(guess, name="b"))), {"a", "b"}, scene
+    )
+    assert guessed == (("a", "illumination"),)  # b is there already
+    torch.testing.assert_close(found.psi, psi[[1, 1]])
 
 
 def test_the_boxes_of_a_target_are_read_off_the_loop_s_renders(scene, monkeypatch):

@@ -94,3 +94,16 @@ def test_folds_share_the_images_of_every_class_and_their_mean_loss_is_the_whole(
 def test_more_folds_than_images_are_an_image_each(made, generator):
     objective, _ = made("loss")
     assert [len(fold.images) for fold in objective.folds(20, generator)] == [1] * 10
+
+
+def test_a_class_is_unseen_whose_score_without_its_loss_is_next_to_nothing(made, monkeypatch):
+    objective, params = made("average_precision")
+    outputs = objective.outputs(params)
+    for kind, parts, wanted in [
+        (SmoothAP, [[0.01, 0.009], [0.01, 0.011]], [True, False]),
+        (SmoothAP, [[torch.nan, torch.nan], [0.0, 0.0]], [False, True]),
+    ]:
+        monkeypatch.setattr(kind, "__call__", lambda *_, parts=parts: torch.tensor(parts))
+        assert objective.unseen(outputs).tolist() == wanted
+    objective, params = made("loss")
+    assert objective.unseen(objective.outputs(params)).tolist() == [False, False]

@@ -138,6 +138,16 @@ def test_summary_names_every_method_and_object(results):
         assert word in text
 
 
+def test_the_summary_names_objects_that_are_not_found_unless_the_scale_says_that_scores_mean_nothing(results):
+    assert "next to nothing" not in results.summary()
+    name, other = results.names[:2]
+    learned = {**results.ap["learned"], "per_class": {name: 0.013, other: math.nan}}
+    unfound = dataclasses.replace(results, ap={**results.ap, "learned": learned})
+    assert f"whether their fields are good: {name} (AP 1.3)\n" in unfound.summary()
+    smoke = dataclasses.replace(unfound, made=dataclasses.replace(results.made, scale="smoke"))
+    assert "next to nothing" not in smoke.summary()
+
+
 def test_a_classification_run_says_accuracy_where_others_say_ap(results, uri, tmp_path):
     scores = {"accuracy": 0.5, "per_class": {"a": 0.6, "b": float("nan")}}
     point = {"iteration": 1, "images": 9, "seconds": 2.0, "ap": scores}

@@ -16,7 +16,7 @@ from typing_extensions import override
 from neural_sim.detector.trajectory import Recording
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, certify
-from neural_sim.outer.first_step import FirstStep, read_objects
+from neural_sim.outer.first_step import FirstStep, read_objects, with_guesses
 from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.objective import Objective
@@ -76,6 +76,7 @@ class GradientLoop(OuterLoop, ABC):
         self._folds: list[Objective] = []
         self._before_folds = generator.get_state()
         self._stopped = False
+        self._trained: Trained | None = None  # at psi, with the present random numbers, to be differentiated
 
     @override
     def training_step(self, batch: int, batch_idx: int) -> None:
@@ -107,7 +108,10 @@ class GradientLoop(OuterLoop, ABC):
         self.trajectory.append(self.psi.detach().clone())
 
     def _offer(self) -> None:
-        """Move to the psi that the first step proposes, after a training at the initial psi for comparison."""
+        """Move to the psi that the first step proposes, after a training at the initial psi for comparison.
+
+        That training also shows which of the objects without an estimate the detector does not find.
+        """
         steps = self.steps
         if self.first is None or not isinstance(steps, TrustRegionSteps):
             return
@@ -115,16 +119,29 @@ class GradientLoop(OuterLoop, ABC):
             scene, images = self.inner.pool or self.scene, self.inner.objective.images
             numbers = stream(0, "common first step", self.numbers.generator)
             proposal = self.first.propose(scene, images, self.psi.detach().clone(), numbers)
-            tried = steps.offer(proposal)
+            offered = steps.offer(proposal).pending
         self.charge(Cost(images=proposal.images))
-        self._offered, self.shown = tried.pending, proposal.shown
+        self.shown = proposal.shown
         for one in proposal.shown:
             _log.info("first step: %s", one.sentence)
-        if self._offered:
-            self._before = self.train_on(self.psi).scores
-            self._saw(self._before, self.objects.names)
-            self.steps = tried
-            self.psi.data[self._labels] = tried.reported
+        unread = set(self.objects.names) - read_objects(proposal.shown)
+        if not offered and not with_guesses(proposal, unread, self.scene)[1]:
+            return
+        trained = self.train_on(self.psi, None if offered else self._recording)
+        unseen = {name for name in unread if trained.unseen[self.scene.names.index(name)]}
+        proposal, guessed = with_guesses(proposal, unseen, self.scene)
+        for name, factor in guessed:
+            _log.info(
+                "first step: the detector does not find the %s, so a guess of its %s is tried", name, factor
+            )
+        tried = steps.offer(proposal)
+        if not tried.pending:
+            self._trained = trained
+            return
+        self._before, self._offered = trained.scores, True
+        self._saw(self._before, self.objects.names)
+        self.steps = tried
+        self.psi.data[self._labels] = tried.reported
 
     def _settle(self, verdicts: Mapping[str, Verdict]) -> None:
         """Hold still the objects that have an estimate from the first step; if these are all objects, the loop ends.
@@ -186,7 +203,7 @@ class GradientLoop(OuterLoop, ABC):
             # The warm start was trained at this psi, with more images and steps than an iteration.
             trained = self.charged(self.inner.untrained(self.psi, self.numbers, self.theta))
         else:
-            trained = self.train_on(self.psi, self._recording)
+            trained, self._trained = self._trained or self.train_on(self.psi, self._recording), None
         with self.timed("judge"):
             self._before = trained.scores
         self._saw(self._before, self.objects.names)

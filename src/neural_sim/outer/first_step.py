@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
@@ -15,9 +15,13 @@ from neural_sim.baseline.label_shift.estimate import Groups, estimate
 from neural_sim.baseline.label_shift.evidence import MOVING, FactorEstimate
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.outer.steps import Proposal
+from neural_sim.parameter.distributions import total_variation
 from neural_sim.ranges import validated
 from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
+
+AT_GUESS = 0.05
+"""Total variation between psi and a guess up to which the guess is not worth a training."""
 
 
 @validated
@@ -74,6 +78,37 @@ class WhatTheTargetShows(FirstStep):
             [p_value_of(found.factors, name) for name in scene.names], dtype=torch.float64
         )
         return Proposal(found.psi, p_values, found.images, found.factors)
+
+
+def with_guesses(
+    proposal: Proposal, names: Collection[str], scene: Scene
+) -> tuple[Proposal, tuple[tuple[str, str], ...]]:
+    """Propose guesses for those factors of the named objects that were not read.
+
+    This is for objects that the detector does not find at the present psi, where derivatives say little. Bins become
+    uniform: trained on all of them, the detector finds the object in some. An object has only one light at a time, so
+    for lights the guess is the estimate, although it was too uncertain to be believed. Objects that the proposal moves,
+    and factors that may be right already, stay as proposed.
+
+    Returns:
+        The proposal, and the pairs of object and factor that it moves in addition.
+    """
+    distribution = scene.distribution
+    psi, p_values = proposal.psi.clone(), proposal.p_values.clone()
+    parts, even = (distribution.split(each) for each in (psi, distribution.uniform_of(scene.names).to(psi)))
+    moved = {one.name for one in proposal.shown if one.finding in MOVING}
+    guessed = []
+    for one in proposal.shown:
+        if one.name not in names or one.name in moved or one.finding == "stays":
+            continue
+        label, factor = scene.names.index(one.name), distribution.factor(one.factor)
+        guess = factor.psi_of(torch.tensor(one.p).to(psi)) if one.lights else even[one.factor][label]
+        now = parts[one.factor][label]  # a view of psi
+        if float(total_variation(factor.p_of(now), factor.p_of(guess))) > AT_GUESS:
+            now.copy_(factor.project(guess) if one.lights else guess)
+            p_values[label] = 0.5  # no evidence for it: the training alone decides
+            guessed.append((one.name, one.factor))
+    return replace(proposal, psi=psi, p_values=p_values), tuple(guessed)
 
 
 def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:

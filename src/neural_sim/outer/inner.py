@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neural_sim.detector.cached_set import CachedSet
@@ -147,6 +147,11 @@ class Trained:
     def validation_loss(self) -> float:
         """L_val."""
         return float(self.objective.of_outputs(self._outputs))
+
+    @property
+    def unseen(self) -> Bool[Tensor, "classes"]:
+        """Whether the detector finds next to nothing of a class; see ``Objective.unseen``."""
+        return self.objective.unseen(self._outputs)
 
     @property
     def scores(self) -> Float[Tensor, "classes images"]:

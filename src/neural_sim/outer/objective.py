@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -14,6 +14,9 @@ from neural_sim.detector.protocol import Outputs, Parameters
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.solver.hvp import Term
 from neural_sim.types import LabelledImages
+
+UNSEEN = 0.02
+"""Score below which next to nothing of a class is found."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,16 @@ class Objective:
         ]
         logits, deltas = zip(*parts, strict=True)
         return torch.cat(logits), torch.cat(deltas)
+
+    @torch.no_grad()
+    def unseen(self, outputs: Outputs) -> Bool[Tensor, "classes"]:
+        """Find the classes in the images whose smooth score, without any loss, is below ``UNSEEN``; none with ``Loss``.
+
+        There, next to no detection is right, so the score hardly changes with the parameters, or with psi.
+        """
+        if isinstance(self.score, Loss):
+            return torch.zeros(outputs[0].shape[-1], dtype=torch.bool)
+        return self.score(self.cached.detector, outputs, self.images).sum(1).cpu() < UNSEEN
 
     @torch.no_grad()
     def scores(self, outputs: Outputs) -> Float[Tensor, "classes images"]:

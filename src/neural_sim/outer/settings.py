@@ -53,6 +53,7 @@ class Outer:
             of training at the same psi (``outer.response``, one training for each bin); 0: never.
         first_step: where the loop goes first: along the first derivative, or to an estimate from the target's boxes;
             then only the objects that it could not estimate, or whose estimate a training rejected, follow derivatives.
+            For objects that are neither estimated nor found by the detector, it is a guess (``with_guesses``).
         steps: how psi follows its derivative: freely, or in a trust region. A trust region uses common random numbers,
             and its last iteration only trains, to accept or reject the last step.
         adjoint: the hypergradient of the training that was run, or that at a stationary point (the paper's Eq. 2).

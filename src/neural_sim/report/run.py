@@ -18,6 +18,7 @@ from neural_sim.detector.metrics import mean_of, mean_over
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import finite, markdown_table, plain_table, read_json, write_json
 from neural_sim.outer.certificate import untrusted
+from neural_sim.outer.objective import UNSEEN
 from neural_sim.parameter.distributions import merged, total_variation
 from neural_sim.report.provenance import Made, caution
 
@@ -201,6 +202,11 @@ class RunResults:
             score = f"{100 * self.validation_ap:.1f}"
             lines.append(f"{self.score} on the validation images, after: {score} (to choose settings by)")
         lines += [one.sentence for one in self.shown]
+        if self._unfound and not self.made.caution:
+            lines.append(
+                f"next to nothing of these objects is found, so derivatives say little about their psi; objects.html "
+                f"shows whether their fields are good: {', '.join(self._unfound)}"
+            )
         trust = untrusted(self.records)
         if trust["steps"]:
             lines.append(_trust_line(trust))
@@ -213,6 +219,14 @@ class RunResults:
         if self.left_out:
             lines.append(_left_out_line(self.left_out))
         return "\n".join(lines)
+
+    @property
+    def _unfound(self) -> list[str]:
+        """Names and scores of the objects that the last detector does not find (``objective.UNSEEN``)."""
+        scores = (self.ap.get("learned") or self.ap["ns"])["per_class"]
+        return [
+            f"{name} ({self.score} {100 * value:.1f})" for name, value in scores.items() if value < UNSEEN
+        ]
 
     def _score_table(self) -> str:
         """Return scores, and distances of the distributions to the target's, with a line for each object."""
