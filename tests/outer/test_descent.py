@@ -235,8 +235,8 @@ def test_the_first_step_is_judged_by_a_training_object_by_object(scene, monkeypa
     for (psi, _), wanted in zip(where[1:3], (THERE.double(), right), strict=True):
         torch.testing.assert_close(psi, wanted)
     assert (
-        record.images == 7 + sum(len(images) for images in (torch.empty(12),) * 4) + 2 * 4 * 2 + 2 * 4
-    )  # the estimate's, four trainings', probes of two trials, half of which are new in the second
+        record.images == 7 + 4 * 12 + 4 * 2 + 4
+    )  # the estimate's, four trainings', b's probes of two trials, half of which are new in the second
 
 
 def test_a_first_step_that_is_wrong_is_taken_back_and_the_loop_goes_on(scene, monkeypatch):
@@ -305,9 +305,13 @@ def test_an_object_that_was_read_takes_no_step_along_a_derivative_unless_a_train
     assert learned.records[0].verdicts["a"].accepted == right and len(learned.records) == 3
     _, tried, *_ = learned.trajectory
     assert torch.equal(tried[0], psi[0].double()) == right and bool(tried[1].any())
-    assert set(learned.records[0].certificate.actions) == (
-        {"b"} if right else {"a", "b"}
-    )  # b alone still moves
+    certificate, free = learned.records[0].certificate, {"b"} if right else {"a", "b"}
+    assert set(certificate.actions) == set(certificate.p_values) == free  # b alone still moves
+    # No probes are rendered for the object that is settled, and nothing is differentiated.
+    assert [bool(own) for own in module._probes.probes] == [not right, True]
+    assert (
+        learned.records[0].gradient_norms[0] == 0.0 if right else learned.records[0].gradient_norms[0] > 0.0
+    )
 
 
 @pytest.mark.parametrize("psi", [torch.zeros(2, 4), THERE], ids=["stay", "move"])

@@ -126,9 +126,10 @@ class Certificate:
         doubts: names of the failed conditions on the whole hypergradient.
         p_values: p-values, by object and factor, of the null hypothesis that the derivative is zero. They test this
             iteration's derivative or, for trust-region steps, the average over iterations that the steps follow.
-        actions: what happens to the steps of the objects whose psi is not settled. A step is ``kept`` if no condition
-            fails and its derivative is significant; ``waiting`` then marks the kept steps that wait. A step that is not
-            trusted is ``taken`` in full under ``on_untrusted=keep``.
+            Like ``actions``, they leave out objects whose psi is settled.
+        actions: what happens to steps. A step is ``kept`` if no condition fails and its derivative is significant;
+            ``waiting`` then marks the kept steps that wait. A step that is not trusted is ``taken`` in full under
+            ``on_untrusted=keep``.
     """
 
     adjoint: Quality | None
@@ -155,8 +156,12 @@ class Certificate:
         return replace(self, actions=actions)
 
     def without(self, names: Collection[str]) -> Certificate:
-        """Leave out what happens to the named objects, whose psi is settled."""
-        return replace(self, actions={name: a for name, a in self.actions.items() if name not in names})
+        """Leave out the named objects, whose psi is settled."""
+        actions, p_values = (
+            {name: each for name, each in by_name.items() if name not in names}
+            for by_name in (self.actions, self.p_values)
+        )
+        return replace(self, actions=actions, p_values=p_values)
 
 
 def certify(

@@ -235,6 +235,12 @@ class GradientLoop(OuterLoop, ABC):
         return certificate.waiting(self.steps.waiting).without(self._settled)
 
     @property
+    def free(self) -> LearnedObjects:
+        """The learned objects whose psi is not settled; derivatives are computed for them alone."""
+        names = [name for name in self.objects.names if name not in self._settled]
+        return replace(self.objects, names=names, labels=[self.scene.names.index(name) for name in names])
+
+    @property
     def _certifies(self) -> bool:
         """Return whether this iteration compares its derivative with the response of training."""
         every = self.settings.certify_every
@@ -300,7 +306,7 @@ class GradientLoop(OuterLoop, ABC):
 
     @abstractmethod
     def _derivative(self, trained: Trained, objective: Objective) -> Hypergradient:
-        """Compute the objective's derivative with respect to psi; it is zero for objects that are not learned."""
+        """Compute the objective's derivative with respect to psi; it is zero for objects that are not ``free``."""
 
     def _cosine(self, result: Hypergradient) -> float | None:
         """Compute the cosine of the derivative with an independent reference; None if there is none."""

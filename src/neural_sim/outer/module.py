@@ -88,14 +88,14 @@ class SimulatorModule(GradientLoop):
         return self._with_fixed(self._at_stationary_point(trained, objective, images, problem))
 
     def _images(self, trained: Trained, weights: Float[Tensor, "n"]) -> dict[str, ObjectImages]:
-        """Select the images of each learned object; ``weights`` are the weights of all drawn images."""
+        """Select the images of each free object; ``weights`` are the weights of all drawn images."""
         by_object = object_images(self.scene, trained.rendered, self.psi, weights)
-        return {name: by_object[name] for name in self.objects.names}
+        return {name: by_object[name] for name in self.free.names}
 
     @property
     def _probes_by_name(self) -> dict[str, Mapping[str, Probes]]:
         probed = self._probes
-        named = zip(self.objects.names, self.objects.labels, strict=True)
+        named = zip(self.free.names, self.free.labels, strict=True)
         return {name: {} if probed is None else probed.probes[label] for name, label in named}
 
     def _through_training(
@@ -166,7 +166,7 @@ class SimulatorModule(GradientLoop):
         self._probes = fresh if new == per_bin else self._probes.renewed(fresh)
 
     def _every_bin(self, per_bin: int) -> ProbeSet:
-        """Draw ``per_bin`` images of every bin of every factor of the learned objects, with their features."""
+        """Draw ``per_bin`` images of every bin of every factor of the free objects, with their features."""
         inner = self.inner
         probed = ProbeSet.draw(
             inner.pool or inner.scene,
@@ -175,7 +175,7 @@ class SimulatorModule(GradientLoop):
             per_bin,
             self.psi,
             self.numbers.generator,
-            self.objects.labels,
+            self.free.labels,
         )
         self.charge(Cost(images=len(probed.cached)))
         return probed
@@ -184,4 +184,4 @@ class SimulatorModule(GradientLoop):
     def _cosine(self, result: Hypergradient) -> float | None:
         found = response(self.inner, self.psi, self.numbers, self.theta)
         self.charge(found.cost)
-        return agreement(found.slopes(self.inner, self.psi), self.psi, result, self.objects)
+        return agreement(found.slopes(self.inner, self.psi), self.psi, result, self.free)

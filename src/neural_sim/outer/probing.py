@@ -20,9 +20,9 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ProbeSet:
-    """Stratified samples: images of every bin of every factor of the learned objects, with their features.
+    """Stratified samples: images of every bin of every factor, with their features.
 
-    The bins of an illumination factor are its anchor lights.
+    They show the objects whose derivatives are wanted. The bins of an illumination factor are its anchor lights.
 
     Attributes:
         probes: for each object, by factor, its rows of ``cached``, bin after bin; empty for objects left out.

@@ -152,7 +152,7 @@ class ResponseLoop(GradientLoop):
         slopes = found.slopes(self.inner, self.psi)
         zero = torch.zeros_like(slopes[0])
         gradients = {
-            name: slopes[i] if i in self.objects.labels else zero for i, name in enumerate(self.scene.names)
+            name: slopes[i] if i in self.free.labels else zero for i, name in enumerate(self.scene.names)
         }
         # The errors are unknown. As 0, they leave the scatter between trainings as the only noise of the derivatives.
         return Hypergradient(gradients, dict.fromkeys(gradients, zero), None)
