@@ -63,7 +63,7 @@ def interruptible() -> Iterator[None]:
     A signal that was ignored when the process started stays ignored, such as Ctrl-C in background jobs of a shell.
     """
     global _wakeup
-    ending = _Ending()
+    ending, outer = _Ending(), _wakeup
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     _wakeup = writing
@@ -83,7 +83,7 @@ def interruptible() -> Iterator[None]:
         for signum, handler in before.items():
             signal.signal(signum, handler)
         signal.set_wakeup_fd(wakeup)
-        _wakeup = None
+        _wakeup = outer
         os.write(writing, bytes([_CLOSED]))
         thread.join()
         os.close(reading)
@@ -119,8 +119,11 @@ def ctrl_c_as_exception() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-        _write(_CTRL_C_BACK)
+        try:
+            signal.signal(signal.SIGINT, before)
+        finally:  # once more, because a second Ctrl-C is raised in its place
+            signal.signal(signal.SIGINT, before)
+            _write(_CTRL_C_BACK)
 
 
 def this_process() -> str:
@@ -179,7 +182,7 @@ class _Ending:
     def watch(self, descriptor: int) -> None:
         """Wait for the first signal, report it, and end the process if it has not ended in time."""
         signum, taken = 0, 0
-        while signum not in SIGNALS or (signum == signal.SIGINT and taken):
+        while signum not in SIGNALS or (signum == signal.SIGINT and taken > 0):
             signum = os.read(descriptor, 1)[0]
             if signum == _CLOSED:
                 return

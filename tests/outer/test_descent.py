@@ -261,13 +261,16 @@ def test_a_first_step_shares_no_random_numbers_with_the_trainings_that_judge_it(
     assert taken and len(first.seeds) == 1 and first.seeds[0] not in taken
 
 
+@pytest.mark.parametrize("iterations", [1, 2])
 @pytest.mark.parametrize("psi", [torch.zeros(2, 4), THERE], ids=["uniform", "biased"])
-def test_a_first_step_that_finds_nothing_costs_no_training(scene, monkeypatch, psi):
+def test_a_first_step_that_finds_nothing_costs_no_training(scene, monkeypatch, psi, iterations):
     """From a biased start, the training shows whether objects are found at all; then it is differentiated."""
     monkeypatch.setattr(Trained, "unseen", torch.tensor([False, True]))
     unsure = (replace(SHOWN[0], finding="uncertain"),)
     first = Fake(psi.double(), shown=unsure)
-    plain, module = (checked_loop(scene, 2, psi=psi.double(), **more) for more in ({}, {"first": first}))
+    plain, module = (
+        checked_loop(scene, iterations, psi=psi.double(), **more) for more in ({}, {"first": first})
+    )
     one, other = (learn_psi(loop) for loop in (plain, module))
     assert [r.detector_steps for r in one.records] == [r.detector_steps for r in other.records]
     assert other.records[0].verdicts == {} and other.shown == unsure
@@ -285,7 +288,8 @@ def test_an_object_that_is_neither_read_nor_found_is_guessed_and_then_takes_step
     scored_by(monkeypatch, lambda psi: -psi.abs().amax(1))
     learned = learn_psi(module)
     tried = learned.records[0].verdicts
-    assert ("the detector does not find the a" in caplog.text) == (not finds)
+    assert ("found next to none of it, so a training tries a guess" in caplog.text) == (not finds)
+    assert [one.guessed for one in learned.shown] == [not finds, False]
     if finds:
         assert not tried and torch.equal(learned.trajectory[0], THERE.double())
     else:

@@ -54,17 +54,19 @@ def test_what_is_neither_read_nor_found_is_spread_over_all_bins_that_are_open():
         estimate("d", "pose", 1.0, "uncertain"), estimate("d", "zoom", 0.9, "stays"),
     )  # fmt: skip
     proposal = Proposal(psi, torch.tensor([1.0, 0.01, 1.0, 1.0]), 7, shown)
-    found, spread = with_guesses(proposal, set("abcd"), scene)
+    found = with_guesses(proposal, set("abcd"), scene)
+    guessed = [(one.name, one.factor) for one in found.shown if one.guessed]
     # b moves along zoom, which may be all that it lacks; d is nearly uniform.
-    assert spread == (("a", "pose"), ("c", "pose"), ("c", "zoom"))
+    assert guessed == [("a", "pose"), ("c", "pose"), ("c", "zoom")]
+    assert all("so a training tries a guess" in one.sentence for one in found.shown if one.guessed)
     p = scene.distribution.probabilities(found.psi)
     assert p["pose"][0].tolist() == pytest.approx([0.25] * 4)
     assert p["pose"][2].tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0.0])
     assert p["zoom"][2].tolist() == pytest.approx([0.5, 0.5])
     assert torch.equal(found.psi[[1, 3]], psi[[1, 3]]) and torch.equal(found.psi[0, 4:], psi[0, 4:])
     assert found.p_values.tolist() == pytest.approx([0.5, 0.01, 0.5, 1.0])
-    assert found.images == 7 and found.shown == shown and float(psi[0, 0]) == 4.0
-    assert with_guesses(proposal, {"b"}, scene)[1] == ()
+    assert found.images == 7 and float(psi[0, 0]) == 4.0 and proposal.shown == shown
+    assert with_guesses(proposal, {"b"}, scene).shown == shown
 
 
 def test_a_light_that_is_neither_read_nor_found_is_guessed_because_none_covers_the_others():
@@ -73,10 +75,10 @@ def test_a_light_that_is_neither_read_nor_found_is_guessed_because_none_covers_t
     psi = torch.tensor([[1.0, 0.0, 0.0], [0.1, 0.3, 0.6]]).double()
     guess = estimate("a", "illumination", 0.9, "uncertain")
     guess = replace(guess, p=(0.1, 0.3, 0.6), lights=True)
-    found, guessed = with_guesses(
+    found = with_guesses(
         Proposal(psi, torch.ones(2), 0, (guess, replace(guess, name="b"))), {"a", "b"}, scene
     )
-    assert guessed == (("a", "illumination"),)  # b is there already
+    assert [one.guessed for one in found.shown] == [True, False]  # b is there already
     torch.testing.assert_close(found.psi, psi[[1, 1]])
 
 

@@ -143,7 +143,7 @@ def test_the_summary_names_objects_that_are_not_found_unless_the_scale_says_that
     name, other = results.names[:2]
     learned = {**results.ap["learned"], "per_class": {name: 0.013, other: math.nan}}
     unfound = dataclasses.replace(results, ap={**results.ap, "learned": learned})
-    assert f"whether their fields are good: {name} (AP 1.3)\n" in unfound.summary()
+    assert f"next to nothing is found of {name} (AP 1.3);" in unfound.summary()
     smoke = dataclasses.replace(unfound, made=dataclasses.replace(results.made, scale="smoke"))
     assert "next to nothing" not in smoke.summary()
 

@@ -122,18 +122,20 @@ class GradientLoop(OuterLoop, ABC):
             offered = steps.offer(proposal).pending
         self.charge(Cost(images=proposal.images))
         self.shown = proposal.shown
-        for one in proposal.shown:
+        for one in self.shown:
             _log.info("first step: %s", one.sentence)
-        unread = set(self.objects.names) - read_objects(proposal.shown)
-        if not offered and not with_guesses(proposal, unread, self.scene)[1]:
+        unread = set(self.objects.names) - read_objects(self.shown)
+        if not offered and not steps.offer(with_guesses(proposal, unread, self.scene)).pending:
             return
         trained = self.train_on(self.psi, None if offered else self._recording)
-        unseen = {name for name in unread if trained.unseen[self.scene.names.index(name)]}
-        proposal, guessed = with_guesses(proposal, unseen, self.scene)
-        for name, factor in guessed:
-            _log.info(
-                "first step: the detector does not find the %s, so a guess of its %s is tried", name, factor
-            )
+        with self.timed("judge"):
+            unseen = trained.unseen
+        unfound = {name for name in unread if unseen[self.scene.names.index(name)]}
+        proposal = with_guesses(proposal, unfound, self.scene)
+        self.shown = proposal.shown
+        for one in self.shown:
+            if one.guessed:
+                _log.info("first step: %s", one.sentence)
         tried = steps.offer(proposal)
         if not tried.pending:
             self._trained = trained
@@ -159,13 +161,18 @@ class GradientLoop(OuterLoop, ABC):
 
     def _trained_once(self) -> Trained:
         """Train at psi, to record its score."""
-        trained = self.train_on(self.psi)
+        trained = self._at_psi()
         self._saw(trained.scores, self.objects.names)
+        return trained
+
+    def _at_psi(self, recording: Recording | None = None) -> Trained:
+        """Train at psi, unless that was done already."""
+        trained, self._trained = self._trained or self.train_on(self.psi, recording), None
         return trained
 
     def _judge(self) -> tuple[Trained, dict[str, Verdict]]:
         """Train at psi, and accept or reject the step that led there."""
-        trained, verdicts = self.train_on(self.psi), {}
+        trained, verdicts = self._at_psi(), {}
         with self.timed("judge"):
             scores = trained.scores
             if self.steps.pending:
@@ -203,7 +210,7 @@ class GradientLoop(OuterLoop, ABC):
             # The warm start was trained at this psi, with more images and steps than an iteration.
             trained = self.charged(self.inner.untrained(self.psi, self.numbers, self.theta))
         else:
-            trained, self._trained = self._trained or self.train_on(self.psi, self._recording), None
+            trained = self._at_psi(self._recording)
         with self.timed("judge"):
             self._before = trained.scores
         self._saw(self._before, self.objects.names)

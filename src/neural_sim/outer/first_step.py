@@ -80,25 +80,20 @@ class WhatTheTargetShows(FirstStep):
         return Proposal(found.psi, p_values, found.images, found.factors)
 
 
-def with_guesses(
-    proposal: Proposal, names: Collection[str], scene: Scene
-) -> tuple[Proposal, tuple[tuple[str, str], ...]]:
-    """Propose guesses for those factors of the named objects that were not read.
+def with_guesses(proposal: Proposal, names: Collection[str], scene: Scene) -> Proposal:
+    """Propose guesses for those factors of the named objects that were not read, and mark them as ``guessed``.
 
-    This is for objects that the detector does not find at the present psi, where derivatives say little. Bins become
+    This is for objects that the detector does not find at the present psi, where derivatives are weak. Bins become
     uniform: trained on all of them, the detector finds the object in some. An object has only one light at a time, so
     for lights the guess is the estimate, although it was too uncertain to be believed. Objects that the proposal moves,
     and factors that may be right already, stay as proposed.
-
-    Returns:
-        The proposal, and the pairs of object and factor that it moves in addition.
     """
     distribution = scene.distribution
     psi, p_values = proposal.psi.clone(), proposal.p_values.clone()
     parts, even = (distribution.split(each) for each in (psi, distribution.uniform_of(scene.names).to(psi)))
     moved = {one.name for one in proposal.shown if one.finding in MOVING}
-    guessed = []
-    for one in proposal.shown:
+    shown = list(proposal.shown)
+    for i, one in enumerate(shown):
         if one.name not in names or one.name in moved or one.finding == "stays":
             continue
         label, factor = scene.names.index(one.name), distribution.factor(one.factor)
@@ -107,8 +102,8 @@ def with_guesses(
         if float(total_variation(factor.p_of(now), factor.p_of(guess))) > AT_GUESS:
             now.copy_(factor.project(guess) if one.lights else guess)
             p_values[label] = 0.5  # no evidence for it: the training alone decides
-            guessed.append((one.name, one.factor))
-    return replace(proposal, psi=psi, p_values=p_values), tuple(guessed)
+            shown[i] = replace(one, guessed=True)
+    return replace(proposal, psi=psi, p_values=p_values, shown=tuple(shown))
 
 
 def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:

@@ -204,8 +204,8 @@ class RunResults:
         lines += [one.sentence for one in self.shown]
         if self._unfound and not self.made.caution:
             lines.append(
-                f"next to nothing of these objects is found, so derivatives say little about their psi; objects.html "
-                f"shows whether their fields are good: {', '.join(self._unfound)}"
+                f"next to nothing is found of {', '.join(self._unfound)}; objects.html shows whether their fields are "
+                "good"
             )
         trust = untrusted(self.records)
         if trust["steps"]:
@@ -222,7 +222,7 @@ class RunResults:
 
     @property
     def _unfound(self) -> list[str]:
-        """Names and scores of the objects that the last detector does not find (``objective.UNSEEN``)."""
+        """Names and scores of the objects of which the last detector finds next to nothing."""
         scores = (self.ap.get("learned") or self.ap["ns"])["per_class"]
         return [
             f"{name} ({self.score} {100 * value:.1f})" for name, value in scores.items() if value < UNSEEN

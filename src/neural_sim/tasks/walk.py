@@ -186,8 +186,8 @@ def warn_of_misreading(graph: Graph) -> None:
     if graph.renders_target or not (alone or first):
         return
     _log.warning(
-        "what your photographs show is estimated, and may be wrong: where the bins were known, a third to half of the "
-        "boxes were read right (docs/results.md, On real frames); %s",
+        "what your photographs show is estimated, and may be wrong: where the bins were known, a quarter to half of "
+        "the boxes were read right (docs/results.md, On real frames); %s",
         f"no training judges the estimate with baseline={method.name}, baseline=neural_sim does" if alone
         else "a training judges the estimate; compare its scores with those before",
     )  # fmt: skip

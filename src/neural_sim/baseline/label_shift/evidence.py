@@ -80,6 +80,8 @@ class FactorEstimate:
         converged: whether the search for the mixture converged, which it does not if the likelihood is flat.
         lights: whether ``p`` are weights of lights instead of probabilities of bins.
         repeated: number of further boxes, in near-duplicates of the images that count.
+        guessed: whether a training tried a guess in place of the estimate, because the detector found next to none of
+            the object (``outer.first_step.with_guesses``).
     """
 
     name: str
@@ -100,17 +102,21 @@ class FactorEstimate:
     converged: bool = True
     lights: bool = False
     repeated: int = 0
+    guessed: bool = False
 
     @property
     def sentence(self) -> str:
         """Return the finding as a sentence for the console and the pages."""
         if self.finding == "too few boxes":
             repeated = f", and {self.repeated} in images that look like theirs" if self.repeated else ""
-            return f"{self.name}: too few boxes ({self.boxes}{repeated}) to estimate its {self.factor}"
+            ending = f", {self._otherwise}" if self.guessed else ""
+            return (
+                f"{self.name}: too few boxes ({self.boxes}{repeated}) to estimate its {self.factor}{ending}"
+            )
         if self.finding == "fits no render":
             return (
                 f"{self.name}: its boxes do not look like its renders (a box is stranger than a held-out render in "
-                f"{self.strange:.0%} of pairs, 50% if they look alike), so its {self.factor} stays"
+                f"{self.strange:.0%} of pairs, 50% if they look alike), {self._otherwise}"
             )
         if self.finding == "not told apart":
             why = f"{self.accuracy:.0%} of held-out ones are recognised, {self.chance:.0%} by chance"
@@ -119,11 +125,11 @@ class FactorEstimate:
                 why = f"weights explain {explained:.0%} of the variance of guesses on held-out ones"
             if not self.converged:
                 why = f"the likelihood is flat; {why}"
-            return f"{self.name}: its {self.factor} cannot be read from renders ({why}), so psi stays"
+            return f"{self.name}: its {self.factor} cannot be read from renders ({why}), {self._otherwise}"
         if self.finding == "uncertain":
             return (
                 f"{self.name}: its boxes do not determine its {self.factor} (the estimate may be off by "
-                f"{self.doubt:.2f} in total variation), so psi stays"
+                f"{self.doubt:.2f} in total variation), {self._otherwise}"
             )
         shown = ", ".join(
             f"{self._called(group)} ({_sum(self.low, group):.2f} to {_sum(self.high, group):.2f})"
@@ -139,6 +145,12 @@ class FactorEstimate:
             )
         where = "under" if self.lights else f"in {self.factor}"
         return f"your target shows the {self.name} {where} {shown}{ending}"
+
+    @property
+    def _otherwise(self) -> str:
+        if self.guessed:
+            return "and the detector found next to none of it, so a training tries a guess"
+        return "so psi stays"
 
     def _called(self, group: Sequence[int]) -> str:
         what = ("light" if self.lights else "bin") + ("s" if len(group) > 1 else "")
