@@ -6,10 +6,11 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.smooth_scores import SmoothAP
 from neural_sim.detector.training import Training
+from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.implicit import Implicit
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.outer.certificate import Trust
-from neural_sim.outer.inner import InnerLoop, LoopInputs
+from neural_sim.outer.inner import InnerLoop, LoopInputs, Trained
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.objective import Loss
 from neural_sim.outer.settings import Outer
@@ -67,3 +68,27 @@ def small_loop(
     training = Training(batch_size=4, weight_decay=0.0)
     inner = InnerLoop.prepare(scene, inputs, settings, training, generator, estimator.draws)
     return SimulatorModule(inner, psi, estimator, solver, generator, first)
+
+
+def checked_loop(scene, iterations=3, **outer):
+    return small_loop(
+        scene, StratifiedEstimator(probes_per_bin=2), iterations, pool_per_bin=2, **(CHECKED | outer)
+    )
+
+
+def watch(monkeypatch, cls, name):
+    """The arguments of every call of a method, which is called all the same."""
+    calls, original = [], getattr(cls, name)
+
+    def watched(self, *arguments, **keywords):
+        calls.append((self, arguments, keywords))
+        return original(self, *arguments, **keywords)
+
+    monkeypatch.setattr(cls, name, watched)
+    return calls
+
+
+def scored_by(monkeypatch, worth):
+    """Let trainings score what ``worth`` says of their psi [objects, K], alike in every validation image."""
+    scores = property(lambda trained: worth(trained.psi).double()[:, None].expand(2, 6) / 6)
+    monkeypatch.setattr(Trained, "scores", scores)

@@ -28,7 +28,7 @@ LIMIT = 1.7
 _LINE = "neural-sim: ended by {}; the same command resumes from the results in the store\n"
 _last_acts: list[Callable[[Interrupted], object]] = []
 _wakeup: int | None = None
-"""Where signals are written for the second thread, in their order; None outside ``interruptible``."""
+"""Descriptor of the pipe that tells the second thread of signals in order; None outside ``interruptible``."""
 # What else is written there, in bytes that are no signal's number.
 _CLOSED, _CTRL_C_TAKEN, _CTRL_C_BACK, _RAISED = 0, 100, 101, 128
 

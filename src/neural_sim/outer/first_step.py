@@ -97,10 +97,12 @@ def with_guesses(proposal: Proposal, names: Collection[str], scene: Scene) -> Pr
         if one.name not in names or one.name in moved or one.finding == "stays":
             continue
         label, factor = scene.names.index(one.name), distribution.factor(one.factor)
-        guess = factor.psi_of(torch.tensor(one.p).to(psi)) if one.lights else even[one.factor][label]
+        guess = even[one.factor][label]
+        if one.lights:
+            guess = factor.project(factor.psi_of(torch.tensor(one.p).to(psi)))
         now = parts[one.factor][label]  # a view of psi
         if float(total_variation(factor.p_of(now), factor.p_of(guess))) > AT_GUESS:
-            now.copy_(factor.project(guess) if one.lights else guess)
+            now.copy_(guess)
             p_values[label] = 0.5  # no evidence for it: the training alone decides
             shown[i] = replace(one, guessed=True)
     return replace(proposal, psi=psi, p_values=p_values, shown=tuple(shown))

@@ -150,7 +150,7 @@ class Trained:
 
     @property
     def unseen(self) -> Bool[Tensor, "classes"]:
-        """Whether the detector finds next to nothing of a class; see ``Objective.unseen``."""
+        """The classes that the detector hardly ever finds; see ``Objective.unseen``."""
         return self.objective.unseen(self._outputs)
 
     @property

@@ -223,7 +223,7 @@ class RunResults:
     @property
     def _unfound(self) -> list[str]:
         """Names and scores of the objects of which the last detector finds next to nothing."""
-        scores = (self.ap.get("learned") or self.ap["ns"])["per_class"]
+        scores = self.ap["learned"]["per_class"]
         return [
             f"{name} ({self.score} {100 * value:.1f})" for name, value in scores.items() if value < UNSEEN
         ]
